@@ -1,10 +1,10 @@
-"""Access CAN interfaces: bus ports, their receiving threads, and frame log files.
+"""Access to CAN interfaces: ports, receiving threads and log files.
 
-The module ``socketcan`` receives batches of frames with the system call recvmmsg(2), and reads the kernel's
-counter of dropped frames. ``port`` sends and counts frames and reopens failed interfaces; ``receiver``
-contains the receiving threads.
+``port`` sends and receives frames, and reopens failed interfaces. ``socketcan`` receives batches of frames
+with recvmmsg(2). ``receiver`` contains the receiving threads. ``frame_log`` and ``frame_log_reader`` write
+and read log files.
 
-No other package in the project uses python-can at run time.
+No other package of this project uses python-can at run time.
 """
 
 from skinnode.transport.frame import Frame

@@ -1,6 +1,6 @@
-"""Fault confinement states of a CAN controller (ISO 11898-1), as reported by SocketCAN error frames.
+"""Fault confinement states of a CAN controller (ISO 11898-1), decoded from SocketCAN error frames.
 
-The encoding of SocketCAN error frames is defined in <linux/can/error.h>.
+<linux/can/error.h> defines the format of error frames.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ class BusState(StrEnum):
 
     ACTIVE = "error active"
     WARNING = "error warning"
-    """At least one error counter has reached the warning limit; the controller is still error active."""
+    """An error counter has reached the warning limit. The controller is still error active."""
     PASSIVE = "error passive"
-    """At least one error counter has reached the error passive limit; the controller still sends and
-    receives."""
+    """An error counter has exceeded the error active range. The controller still sends and receives."""
     OFF = "bus-off"
-    """The controller neither sends nor receives frames."""
+    """The controller neither sends nor receives."""
 
 
 def bus_state(frame: Frame) -> BusState | None:
-    """Return the controller state reported by a SocketCAN error frame; None if the frame reports no state."""
+    """Return the state that a SocketCAN error frame reports, or None if it reports no state."""
     if frame.can_id & _BUS_OFF:
         return BusState.OFF
     if frame.can_id & _RESTARTED:

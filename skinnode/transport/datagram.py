@@ -1,8 +1,7 @@
-"""Provide a UDP bus for load tests. Each UDP packet contains one frame in SocketCAN's memory layout.
+"""UDP bus for load tests. Each UDP packet contains one frame in SocketCAN's memory layout.
 
-The UDP packets are received by the same reader as SocketCAN frames, so the load tests also cover the system
-calls, timestamps and drop counter of this reader. UDP over the loopback device replaces the kernel's CAN
-driver and CAN protocol layer.
+The packets are received by the reader for SocketCAN frames, so load tests cover its system calls, timestamps
+and drop counter. UDP over the loopback device stands in for the kernel's CAN driver and CAN protocol layer.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ def free_channel() -> str:
 
 
 class DatagramPort(CanPort):
-    """Receive-only port for a UDP bus. The ``channel`` of a UDP bus is the number of a UDP port."""
+    """Port that only receives, from a UDP bus. The ``channel`` of a UDP bus is a UDP port number."""
 
     def _open(self) -> can.BusABC:
         try:

@@ -1,4 +1,4 @@
-"""Received CAN frame, in the same form for every type of interface."""
+"""Received CAN frame, in the same form on every type of interface."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """A received CAN frame.
+    """Received CAN frame.
 
-    ``t_ns`` is the arrival time on the monotonic clock. ``data`` is empty in a remote frame.
+    ``t_ns`` is the arrival time on the monotonic clock, ns. ``data`` is empty for a remote frame.
     """
 
     can_id: int

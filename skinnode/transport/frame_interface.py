@@ -1,4 +1,4 @@
-"""Optional methods of a python-can interface that exchange frames without python-can's messages."""
+"""Optional methods with which a python-can interface exchanges frames directly, not as ``can.Message``."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from skinnode.transport.frame import Frame
 
 @runtime_checkable
 class FrameInterface(Protocol):
-    """python-can interface with methods that :class:`~skinnode.transport.CanPort` uses in place of messages.
+    """python-can interface with methods for frames, which :class:`~skinnode.transport.CanPort` then uses.
 
-    Converting each frame to a ``can.Message`` and back takes longer than all other work of a simulated bus.
+    On a simulated bus, converting frames to ``can.Message`` and back would take longer than everything else.
     """
 
     def send_frame(self, can_id: int, data: bytes, *, remote: bool, fd: bool) -> None:
-        """Queue a frame with an 11-bit identifier; a CAN FD frame switches the bit rate.
+        """Queue a frame with an 11-bit identifier. CAN FD frames use bit rate switching.
 
         Raises:
             can.CanError: if the interface rejects the frame or is closed.
         """
 
     def read_frames(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return the frames that have arrived; if there are none, wait for the first frame.
+        """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum wait for the first frame, s.
+            timeout_s: Maximum time to wait for a frame, s.
             most: Maximum number of frames.
 
         Raises:

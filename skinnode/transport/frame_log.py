@@ -1,9 +1,8 @@
-"""Write CAN frames to a candump text file (``.log``) or a Vector BLF file.
+"""Writes CAN frames to a candump log (``.log``) or a Vector BLF file.
 
-If the process is killed, the file contains at least the frames written before the last
-:meth:`FrameLog.flush`. python-can's BLF writer buffers up to 128 kB of frames and completes the file header
-only when the writer stops. Flushing a BLF file therefore stops the writer, and the next frame is written by a
-new writer in append mode.
+If the process is killed, no frame written before the last :meth:`FrameLog.flush` is lost. python-can's BLF
+writer buffers up to 128 kB, and completes the file header only when it stops. Flushing a BLF file therefore
+stops the writer, and a new writer appends the next frame.
 """
 
 from __future__ import annotations
@@ -22,31 +21,31 @@ LogFormat = Literal["log", "blf"]
 SUFFIXES: Final = (".log", ".blf")
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Maximum size of a BLF container before compression, bytes. The limit exceeds the amount of data written
-between two flushes, so that no frame is split between containers."""
+"""Maximum size of a BLF container before compression, bytes. Less is written between two flushes, so no frame
+is split between containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """CAN frame in a log file. The timestamp ``t_ns`` is a wall-clock time with a resolution of 1 µs."""
+    """CAN frame in a log file. Its ``t_ns`` is a wall-clock time with a resolution of 1 µs."""
 
     frame: Frame
     channel: str
-    """Name of the channel. A BLF file contains no channel names; when such a file is read, this is the number
-    of the channel, counted from 0."""
+    """Name of the channel or, if read from a BLF file, its number counted from 0."""
     sent: bool
-    """Whether the recording program sent the frame."""
+    """Whether the recording program itself sent the frame."""
 
 
 class FrameLog:
-    """Log file to which CAN frames are written. Owned by one thread.
+    """Log file to which CAN frames are written. Only one thread may use it.
+
+    :meth:`write` and :meth:`flush` raise OSError if writing fails.
 
     Args:
-        path: Path of the file to create, ending in ``.log`` or ``.blf``.
-        channels: Names of the channels; BLF numbers them in this order.
+        path: Path of the new file, ending in ``.log`` or ``.blf``.
+        channels: Names of the channels. In a BLF file, they are numbered in this order.
 
     Raises:
-        ConfigError: if the file already exists or cannot be created.
-        OSError: raised by the other methods if writing fails.
+        ConfigError: if the suffix is wrong, or if the file already exists or cannot be created.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
@@ -62,7 +61,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame. A crash before the next :meth:`flush` can lose the frame."""
+        """Write a frame, which a crash before the next :meth:`flush` may lose."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()
@@ -83,11 +82,10 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass all data to the operating system, so that killing the process does not lose any frames.
+        """Pass all frames to the operating system, so that they survive the end of the process.
 
         Args:
-            to_disk: Whether to wait until the data are on the disk, so that a power failure does not lose
-                them.
+            to_disk: Whether to wait until the frames are on the disk, so that they survive a power failure.
         """
         if self._is_blf:
             self._end_blf()
@@ -97,10 +95,7 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file.
-
-        Errors while closing are ignored, because earlier calls have already reported any disk error.
-        """
+        """Close the file. Disk errors are ignored here, because earlier calls have reported them."""
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):
@@ -119,7 +114,7 @@ class FrameLog:
         try:
             writer.stop()
         finally:
-            with contextlib.suppress(OSError):  # if the disk is full, closing raises the same error again
+            with contextlib.suppress(OSError):  # a full disk raises the same error again
                 writer.file.close()
 
 
@@ -127,7 +122,7 @@ def create(path: Path) -> TextIO:
     """Create a new text file.
 
     Raises:
-        ConfigError: if the file exists already, or cannot be created.
+        ConfigError: if the file already exists or cannot be created.
     """
     try:
         return path.open("x", encoding="ascii")

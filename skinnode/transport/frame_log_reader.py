@@ -1,9 +1,8 @@
-"""Read frames from a candump log or a BLF file, even if the file is damaged.
+"""Reads CAN frames from a candump log or a BLF file, even if the file is damaged.
 
-The reader skips damaged parts of a truncated or partly overwritten file and reads all other frames. Each
-damaged part is counted, and the line or offset of the part is recorded (:class:`Damage`). Invalid file
-content never causes an exception. In a candump log, which has no checksums, a corrupted frame cannot be
-detected if the frame is still well-formed.
+The reader skips the damaged parts of a truncated or partly overwritten file, and records where they are
+(:class:`Damage`). Invalid content never causes an exception. A candump log has no checksums, so a corrupt
+frame is not detected if it is well-formed.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
 
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damaged parts whose descriptions are kept. Further damaged parts are only counted."""
+"""Maximum number of damaged parts that are described. Further ones are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Damaged, unreadable part of a log file."""
+    """Damaged part of a log file."""
 
     line: int | None
-    """Line number, counted from 1; None in a BLF file, which has no lines."""
+    """Line number, counted from 1; None for a BLF file."""
     offset: int
     """Offset from the beginning of the file, bytes."""
     what: str
@@ -46,20 +45,20 @@ class Damage:
 
 
 class _Container(NamedTuple):
-    """Container in a BLF file."""
+    """Container of a BLF file."""
 
     end: int
     """File offset from which to search for the next container, bytes."""
     objects: bytes | None
-    """Content of the container as far as it is readable; None if it is not readable."""
+    """Readable part of the content; None if nothing is readable."""
     intact: bool = False
 
 
 class FrameLogReader:
-    """Reader that yields the frames of a log file; it can be iterated over only once. Owned by one thread.
+    """Iterable over the frames of a log file. It can be iterated over once, by one thread.
 
     Raises:
-        ConfigError: if the file cannot be opened, or has a suffix other than ``.log`` and ``.blf``.
+        ConfigError: if the file cannot be opened, or its suffix is neither ``.log`` nor ``.blf``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,9 +70,9 @@ class FrameLogReader:
             raise ConfigError("recording", str(path), f"a file that can be read ({error.strerror})") from None
         self.path = path
         self.damages: list[Damage] = []
-        """Descriptions of the first :data:`DAMAGES_KEPT` damaged parts of the file."""
+        """First :data:`DAMAGES_KEPT` damaged parts of the file."""
         self.damaged = 0
-        """Number of damaged parts of the file found so far."""
+        """Number of damaged parts found so far."""
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         with self._file:
@@ -123,7 +122,7 @@ class FrameLogReader:
                 if objects is not None:
                     whole, tail = self._whole_objects(tail + objects, at)
                     yield from self._frames(header, whole, at)
-                if not intact:  # with a wrong length, a partial frame could include the frames that follow
+                if not intact:  # the length of a partial frame may be wrong, so do not complete it
                     tail = b""
                 following = _find_container(data, end)
                 if following > end + _PADDING_BYTES and intact:
@@ -134,9 +133,10 @@ class FrameLogReader:
                 self._complain(None, size, f"truncated: a frame that ends after {counted(len(tail), 'byte')}")
 
     def _container(self, data: mmap.mmap, at: int) -> _Container:
-        """Return the end and the content of the BLF container at file offset ``at``.
+        """Return the BLF container at file offset ``at``.
 
-        A damaged container is assumed to end directly after its header, because its length may be wrong.
+        The length of a damaged container may be wrong, so the search for the next one starts directly after
+        its header.
         """
         _, _, _, size, _ = _OBJECT.unpack_from(data, at)
         begin, end = at + _CONTAINER_HEAD_BYTES, at + size
@@ -166,9 +166,9 @@ class FrameLogReader:
         return _Container(min(end, len(data)), objects, intact=True)
 
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
-        """Return the complete objects in ``data``, and the incomplete object at the end of ``data``."""
+        """Split ``data`` into its complete objects and an incomplete object at its end."""
         pieces: list[bytes] = []
-        begin = at = 0  # offset of the first object after the last gap, and of the next object
+        begin = at = 0  # offsets of the first object after the last gap, and of the next object
         while True:
             start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
             if start < 0 and len(data) - at <= _PADDING_BYTES:
@@ -192,13 +192,13 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """Yield the CAN frames in ``objects``, parsed by python-can as an in-memory BLF file."""
+        """Yield the CAN frames in ``objects``. python-can parses them as a BLF file in memory."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:
             for message in can.BLFReader(file):
                 yield _blf_frame(message)
-        except Exception as error:  # python-can's parser raises various exceptions on invalid data
+        except Exception as error:  # python-can raises various exceptions for invalid data
             self._complain(None, container, f"objects that cannot be read ({type(error).__name__}: {error})")
 
 
@@ -214,7 +214,7 @@ _ERROR_BIT: Final = 0x2000_0000
 
 
 def _candump_frame(line: bytes) -> LoggedFrame | None:
-    """Parse a line written by ``candump -L`` or python-can; return None for any other line."""
+    """Parse a line written by ``candump -L`` or python-can. Return None for any other line."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None
@@ -259,7 +259,7 @@ _MOST_OBJECT: Final = 1 << 16
 
 
 def _find_container(data: mmap.mmap, at: int) -> int:
-    """Return the file offset of the next container, or the file's length if there is no further container."""
+    """Return the file offset of the next container, or the length of the file if there is none."""
     while (at := data.find(b"LOBJ", at)) >= 0:
         if at + _OBJECT.size <= len(data):
             _, _, _, size, kind = _OBJECT.unpack_from(data, at)

@@ -1,9 +1,8 @@
-"""Provide a CAN bus endpoint with the same behaviour on every type of interface.
+"""CAN bus endpoint with the same behaviour on every type of interface.
 
-Every error of python-can is converted to a :class:`~skinnode.errors.BusError` with a one-line message.
-Arrival times are times on the host's monotonic clock. If an interface timestamps frames with the wall clock,
-the timestamps are converted to the monotonic clock. The interfaces virtual, udp_multicast and socketcan
-provide such timestamps.
+Errors of python-can are converted to :class:`~skinnode.errors.BusError` with a one-line message. Arrival
+times are on the host's monotonic clock. The interfaces virtual, udp_multicast and socketcan provide
+wall-clock timestamps, which are converted.
 """
 
 from __future__ import annotations
@@ -33,55 +32,54 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames. The queue can store 4 s of
-traffic from a fully loaded bus at 1 Mbit/s."""
+"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames; 4 s of traffic at 1 Mbit/s and
+full load."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Size of a socket's receive buffer that is requested from the kernel, bytes. A frame in the buffer occupies
-about 800 bytes."""
+"""Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of it."""
 
-# Python has no names for these constants from <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>.
+# From <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>; Python does not define these constants.
 SO_RCVBUFFORCE: Final = 33
 _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum age of a frame's timestamp, s. An older timestamp, or a timestamp in the future, cannot come from
-this machine's wall clock and is replaced by the time of reading."""
+"""Maximum plausible age of a timestamp, s. An older timestamp, or one in the future, does not come from this
+machine's wall clock and is replaced by the time at which the frame is read."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Error codes that the kernel returns after an interface went down. Only the first call after this event,
-either a send or a receive call, returns the error."""
+"""Error codes of the kernel for an interface that has gone down. The kernel reports this only once, to the
+next send or receive call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Maximum time that the kernel is assumed to take to deliver a frame, s. The longest delivery time observed
-was 28 ms."""
+"""Maximum time that the kernel needs to deliver a frame, s. The longest time observed was 28 ms."""
 
-# Without a handler, python-can would print warnings to stderr in programs that do not configure logging. The
-# same errors are already reported by BusError.
+# Without a handler, programs that do not configure logging would print python-can's warnings to stderr.
+# BusError already reports the same errors.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 def is_interface(config: BusConfig) -> bool:
-    """Return whether python-can or one of its plugins provides the bus's type of interface."""
+    """Return whether python-can or one of its plugins provides the interface of a bus."""
     return config.interface in can.VALID_INTERFACES
 
 
 def allowed_interfaces(config: BusConfig) -> str:
-    """Return text that lists python-can's interface types and suggests the closest match."""
+    """Return a text that lists all interfaces and suggests the closest match."""
     known = ", ".join(sorted(can.VALID_INTERFACES))
     near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
     return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"
 
 
 class _Message(can.Message):
-    """CAN message that is copied five times as fast as python-can's ``Message``.
+    """CAN message that can be copied quickly.
 
-    Fast copying is important, because python-can's virtual bus copies each message once per receiver.
+    python-can's virtual bus copies each message for every receiver, and copying a plain ``can.Message`` takes
+    five times as long.
     """
 
     __slots__ = ()
@@ -104,7 +102,7 @@ class _Message(can.Message):
 
 
 def open_can_bus(config: BusConfig) -> can.BusABC:
-    """Open a python-can bus, for a program that does not use :class:`CanPort`.
+    """Open a python-can bus. Most programs use :class:`CanPort` instead.
 
     Args:
         config: Interface, channel, bit rates and options of the bus.
@@ -140,10 +138,10 @@ def _where(config: BusConfig) -> str:
 class CanPort:
     """Endpoint on a CAN bus, open until :meth:`close` is called or a ``with`` block ends.
 
-    An endpoint does not receive the frames that it sends. python-can's configuration files and environment
-    variables are ignored.
+    An endpoint does not receive its own frames. Configuration files and environment variables of python-can
+    are ignored.
 
-    Threads: any thread may send; only one thread may receive.
+    Threads: any thread may send, but only one thread may receive.
 
     Args:
         config: Interface, channel, bit rates and options of the bus.
@@ -158,15 +156,15 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = threading.Lock()  # protects the counters when several threads call send()
+        self._counting = threading.Lock()  # protects the counters of send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
         self._dropped_before = 0  # number of frames dropped by earlier readers
         self._away = False
         self._bus = self._open()
         self._direct = _direct(self._bus)
         self._reader = self._open_reader()
-        # The sender of a multicast frame also receives the frame. To recognise its own frames, this port
-        # sends a unique tag in the channel field, which python-can transmits but does not use.
+        # A multicast sender also receives its own frames. They are recognised by a unique tag in the channel
+        # field, which python-can transmits but does not use.
         self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
 
@@ -174,7 +172,7 @@ class CanPort:
         return open_can_bus(self.config)
 
     def _open_reader(self) -> SocketReader | None:
-        """Return the reader for SocketCAN frames; None for other interfaces."""
+        """Return a reader for SocketCAN frames, or None for other interfaces."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
@@ -189,17 +187,17 @@ class CanPort:
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor; -1 if the port is not pollable or is closed."""
+        """Return the file descriptor of the socket, or -1 if the port is closed or not pollable."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property
     def sent(self) -> int:
-        """Number of frames sent to the interface."""
+        """Number of frames that the interface has accepted for sending."""
         return self._sent
 
     @property
     def received(self) -> int:
-        """Number of frames read from the interface, excluding the endpoint's own frames."""
+        """Number of frames received from other endpoints."""
         return self._received
 
     @property
@@ -209,34 +207,33 @@ class CanPort:
 
     @property
     def undelivered(self) -> int:
-        """Number of sent frames not delivered to all endpoints of a virtual bus due to a full queue."""
+        """Number of frames sent on a virtual bus that an endpoint lost because its queue was full."""
         return self._undelivered
 
     @property
     def malformed(self) -> int:
-        """Number of received multicast packets that were not CAN frames."""
+        """Number of multicast packets received that were not CAN frames."""
         return self._malformed
 
     @property
     def dropped(self) -> int:
-        """Number of frames dropped because the kernel's receive buffer was full; 0 except with socketcan."""
+        """Number of frames dropped because the kernel's receive buffer was full; 0 except on socketcan."""
         return self._dropped_before + (0 if self._reader is None else self._reader.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
 
-        On a bus with ``fd``, data of more than 8 bytes are sent as a CAN FD frame with bit-rate switching,
-        padded with zeros to a valid length. On a virtual bus, an endpoint with a full receive queue does not
-        receive the frame.
+        More than 8 bytes are sent in a CAN FD frame with bit rate switching, padded with zeros to a valid
+        length. On a virtual bus, an endpoint whose receive queue is full loses the frame.
 
         Args:
             can_id: Identifier, 0 to 0x7FF.
-            data: Payload of up to 8 bytes, or up to 64 bytes on a bus with ``fd``.
+            data: Payload of up to 8 bytes, or up to 64 bytes on a CAN FD bus.
             remote: Whether to send a remote frame.
 
         Raises:
             BusError: if the interface rejects the frame.
-            ValueError: if the identifier or the payload length is out of range for this bus.
+            ValueError: if the identifier or the payload length is out of range.
         """
         if not 0 <= can_id <= 0x7FF:
             raise ValueError(f"can_id: got {can_id}, must be 0 to 0x7FF")
@@ -275,7 +272,7 @@ class CanPort:
         )
 
     def recv(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None if no frame arrives within ``timeout_s``.
+        """Return the next frame, or None if none arrives within ``timeout_s``.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -284,11 +281,11 @@ class CanPort:
         return batch[0] if batch else None
 
     def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return all frames that have arrived. If there are none, wait for the next frame.
+        """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
             timeout_s: Maximum time to wait for a frame, s.
-            most: Maximum number of frames. Only socketcan and timed return more than one frame at a time.
+            most: Maximum number of frames. Interfaces other than socketcan and timed return one at a time.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -325,17 +322,16 @@ class CanPort:
                     self._errors += 1
                     raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
                 self._malformed += 1
-            # The frame was malformed or sent by this endpoint. Wait for another frame for the remaining time.
+            # The packet was malformed or sent by this endpoint: wait for another one.
             timeout_s = max(0.0, (end_ns - clock.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
-        """Close and reopen the interface after a failure, without resetting the counters.
+        """Close and reopen the interface after a failure. The counters keep their values.
 
-        While the interface is closed, sending raises BusError. The receiving thread must have ended before
-        the call.
+        The receiving thread must have ended. While the interface is closed, :meth:`send` raises BusError.
 
         Raises:
-            BusError: if the interface cannot be opened. The call may be repeated.
+            BusError: if the interface cannot be opened. The caller may try again.
         """
         if not self._away:
             self._away = True
@@ -348,14 +344,13 @@ class CanPort:
         self._away = False
 
     def set_bitrate(self, bitrate_bps: int) -> None:
-        """Change the bus's bit rate and reopen the interface.
+        """Change the bit rate and reopen the interface.
 
-        On socketcan, the bit rate is set with ``ip link``, which requires the capability CAP_NET_ADMIN. The
-        receiving thread must have ended before the call.
+        The receiving thread must have ended. On socketcan, the bit rate is set with ``ip link``, which
+        requires the capability CAP_NET_ADMIN.
 
         Raises:
-            BusError: if the interface rejects the bit rate. The interface then remains open at the previous
-                bit rate.
+            BusError: if the interface rejects the bit rate. It is then open at the previous bit rate.
         """
         before = self.config
         self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})
@@ -391,15 +386,15 @@ def _direct(bus: can.BusABC) -> FrameInterface | None:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Enlarge a socket's receive buffer, and restrict reception to the socket's own multicast group."""
+    """Enlarge the receive buffer of a socket, and limit reception to its own multicast group."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
             duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds the socket to all addresses. By default, such a socket receives the frames of every
-        # multicast group that any program on the machine has joined.
+        # python-can binds the socket to all addresses. Such a socket receives the packets of every multicast
+        # group that any program on this machine has joined, unless this is disabled.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             _discard_other_groups(duplicate)
@@ -411,10 +406,9 @@ def _tune_socket(fileno: int) -> None:
 
 
 def _discard_other_groups(sock: socket.socket) -> None:
-    """Discard frames that arrived before the restriction to one multicast group took effect.
+    """Discard packets that were received before reception was limited to one multicast group.
 
-    If any frames are discarded, this is repeated after a pause, because the kernel may still be delivering
-    frames.
+    If there were any, discard once more after a pause, because the kernel may still be delivering packets.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)
@@ -422,7 +416,7 @@ def _discard_other_groups(sock: socket.socket) -> None:
 
 
 def _discard_waiting(sock: socket.socket) -> int:
-    """Discard all frames in a socket's receive buffer; return their number."""
+    """Discard all packets in the receive buffer of a socket, and return their number."""
     count = 0
     with contextlib.suppress(BlockingIOError):
         while True:
@@ -448,16 +442,16 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _is_garbage(error: Exception) -> bool:
-    """Return whether an error on a multicast bus was caused by a packet's content, not by the network.
+    """Return whether the content of a multicast packet caused an error.
 
-    A network error is always caused by an OSError; an error due to a packet's content never is.
+    Errors of the network are caused by an OSError; errors due to the content of a packet are not.
     """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
 
 
 def _why(error: BaseException) -> str:
-    """Return the message of the most informative exception in a chain, as a single line."""
+    """Return the message of the original exception in a chain of exceptions, as a single line."""
     while error.__cause__ is not None:
         error = error.__cause__
     if error.__context__ is not None and isinstance(error.__context__, OSError):

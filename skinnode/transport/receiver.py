@@ -1,6 +1,6 @@
-"""Receive CAN frames on dedicated threads, which only put the frames into bounded queues.
+"""Threads that receive CAN frames and put them into bounded queues, from which a reader thread takes them.
 
-A reader thread processes the queued frames. Frames that arrive while a queue is full are dropped and counted.
+Frames that arrive while a queue is full are dropped and counted.
 """
 
 from __future__ import annotations
@@ -20,45 +20,42 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Default capacity of a queue, frames. The queue can store 2 s of traffic from a fully loaded bus at 1 Mbit/s
-(8,000 frames/s)."""
+"""Default capacity of a queue, frames; 2 s of traffic at 1 Mbit/s and full load (8,000 frames/s)."""
 
 _POLL_S: Final = 0.02
-"""Maximum time that a receiving thread waits for a frame before it checks for a request to end, s."""
+"""Maximum time to wait for a frame before the thread checks whether it has to stop, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause between two batches of frames, ns. Without a pause, the receiving thread would wake up for every
-frame, up to 8,000 times per second. The timestamps of the frames do not depend on the pause."""
+"""Pause between batches of frames, ns. Without it, the receiving thread would wake up for every frame, up to
+8,000 times per second. The pause does not affect the timestamps of the frames."""
 
 LONG_NS: Final = 5_000_000
-"""Pause between two batches of frames if the arrival times of all expected frames are predicted, ns. An
-unexpected frame is received with a delay of up to 1.5 times this pause."""
+"""Pause between batches of frames while all arrival times are predicted, ns. An unexpected frame is delayed
+by up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which all earlier frames are fetched, ns. The predicted frame can then
-be fetched without delay."""
+"""Time before a predicted arrival at which the preceding frames are fetched, ns, so that the predicted frame
+itself is fetched without delay."""
 _SHORT_NS: Final = 300_000
-"""Minimum pause between two batches of frames, ns. The minimum pause applies around the predicted arrival
-time of a frame."""
+"""Minimum pause between batches of frames, ns; used around a predicted arrival."""
 _LATE_NS: Final = 600_000
-"""Period after a predicted arrival during which the minimum pause applies, ns."""
+"""Time after a predicted arrival for which the minimum pause is used, ns."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time after a predicted arrival at which a frame is considered lost, ns."""
+"""Time after its predicted arrival at which a frame is considered lost, ns."""
 _ANSWER_NS: Final = 20_000_000
-"""Period after a request during which a response is expected, ns."""
+"""Time after a request within which the response is expected, ns."""
 _LAG_NS: Final = 50_000
-"""Time from the arrival of a frame until the frame can be read from the socket, ns."""
+"""Time from the arrival of a frame until it can be read from the socket, ns."""
 
 
 class Intake:
     """Bounded queue of frames between a receiving thread and the reader thread.
 
-    If the queue is full, newly arrived frames are dropped, as in a full socket buffer, and counted in
-    ``dropped``.
+    While the queue is full, new frames are dropped and counted in :attr:`dropped`.
 
-    Threads: only the reader may call :meth:`take` and :meth:`expect`. Only the receiving thread may call the
-    other methods, except those marked "Any thread".
+    Threads: only the reader thread may call :meth:`take` and :meth:`expect`. Any thread may call
+    :meth:`asked`. Only the receiving thread may call the other methods.
 
     Args:
         port: Port from which frames are received.
@@ -73,40 +70,40 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time before which all received frames have been queued or dropped, ns."""
+        """Monotonic time until which all received frames have been queued or dropped, ns."""
         self.due_ns = 0
-        """Monotonic time of the next :meth:`fetch`, ns. Used only by the receiver."""
+        """Monotonic time of the next :meth:`fetch`, ns."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
-        # The reader thread writes _taken. The receiving thread writes _put and _dropped.
+        # _taken is written by the reader thread, _put and _dropped by the receiving thread.
         self._put = self._taken = self._dropped = 0
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
-        self._first_ns = 0  # earliest predicted arrival; 0 if any group of frames may arrive at any time
+        self._first_ns = 0  # earliest predicted arrival; 0 if a group without a prediction exists
         self._asked_ns = 0
 
     @property
     def dropped(self) -> int:
-        """Number of frames lost because the queue was full.
+        """Number of frames dropped because this queue was full.
 
-        Frames dropped by the kernel are counted in :attr:`CanPort.dropped`.
+        :attr:`CanPort.dropped` counts the frames dropped by the kernel.
         """
         return self._dropped
 
     @property
     def queued(self) -> int:
-        """Number of frames waiting in the queue."""
-        taken = self._taken  # read before _put, so that the result is never negative
+        """Number of frames in the queue."""
+        taken = self._taken  # must be read before _put; otherwise, the result might be negative
         return self._put - taken
 
     def take(self) -> list[Frame]:
         """Return all queued frames in order of arrival, without waiting.
 
         Raises:
-            BusError: if the bus has failed, after all earlier frames have been taken.
-            Exception: any other exception raised by the receiving thread.
+            BusError: if the bus has failed and the queue is empty.
+            Exception: any other exception of the port, if the queue is empty.
         """
-        # Read the error first: the queue then contains all frames that were received before the error.
+        # Read the error first, so that no frame received before the error is missed.
         error, batches = self._error, self._queue
         if not batches:
             if error is not None:
@@ -119,28 +116,23 @@ class Intake:
         return frames
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict the arrival of the last frame in a group, so that this frame is fetched without delay.
+        """Predict when the last frame of a group arrives, so that it is fetched without delay.
 
         Args:
-            what: Name of the group of frames. A prediction replaces the previous prediction for the same
-                group.
-            times_ns: Possible arrival times on the monotonic clock, ascending, ns; empty if the frame may
-                arrive at any time.
+            what: Name of the group. A new prediction replaces the previous one.
+            times_ns: Possible arrival times on the monotonic clock, ns, ascending; empty if unknown.
         """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Announce a response to a request that was sent at monotonic time ``t_ns``.
-
-        Any thread may call this method.
-        """
+        """Announce that a response will follow a request, which was sent at monotonic time ``t_ns``."""
         self._asked_ns = t_ns
 
-    # --- called by the receiver
+    # --- called by the receiving thread
 
     def gather(self, now_ns: int) -> None:
-        """Choose the time of the next fetch, :attr:`due_ns`, until which frames accumulate."""
+        """Choose the time of the next fetch, :attr:`due_ns`."""
         known = now_ns > self._asked_ns + _ANSWER_NS
         if now_ns < self._first_ns:  # fast path, because this method runs after every batch
             awaited_ns = _before(self._first_ns, now_ns)
@@ -150,7 +142,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return the time (ns) to fetch the next predicted frame, and whether all frames are predicted."""
+        """Return when to fetch the next predicted frame (ns), and whether all arrivals are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -163,21 +155,21 @@ class Intake:
 
     @property
     def failed(self) -> bool:
-        """Whether reception has stopped due to an error, until :meth:`Receiver.resume` is called."""
+        """Whether an error has stopped reception. :meth:`Receiver.resume` restarts it."""
         return self._error is not None
 
     def resume(self) -> None:
-        """Clear the error of the failed port."""
+        """Clear the error."""
         self._error = None
 
     def fetch(self, timeout_s: float) -> bool:
-        """Move all frames that have arrived at the port to the queue.
+        """Move the frames that have arrived from the port to the queue.
 
         Args:
             timeout_s: Maximum time to wait for a frame, s.
 
         Returns:
-            Whether :meth:`take` has new frames to return or an error to raise.
+            Whether there are new frames or an error for :meth:`take`.
         """
         now_ns = clock.monotonic_ns()
         try:
@@ -202,7 +194,7 @@ class Intake:
 
 @dataclass(slots=True)
 class _Shared:
-    """State of the receiving thread that several intakes share."""
+    """State of the receiving thread that several ports share."""
 
     intakes: dict[Intake, None]
     """Intakes as keys, in the order in which they were added."""
@@ -210,15 +202,14 @@ class _Shared:
 
 
 class Receiver:
-    """Receives frames from the ports of several intakes until :meth:`close` is called.
+    """Receives frames from several ports until :meth:`close` is called.
 
-    Threads: all ports that can be polled share one receiving thread. Each other port has its own thread,
-    because receiving with python-can may block. If a port fails, reception from the other ports continues.
+    All ports that can be polled share one receiving thread. Each other port has its own thread, because
+    receiving with python-can may block. If a port fails, reception from the other ports continues.
 
     Args:
-        intakes: Queues to fill.
-        on_defect: Function that a receiving thread calls with any exception that does not come from a port.
-            Reception then continues.
+        intakes: Queues to fill, one per port.
+        on_defect: Callback for an exception that does not come from a port. Reception continues afterwards.
     """
 
     def __init__(
@@ -226,7 +217,7 @@ class Receiver:
     ) -> None:
         self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = clock.simple_queue()
-        self._joining: deque[Intake] = deque()  # intakes that the shared thread has not added yet
+        self._joining: deque[Intake] = deque()  # intakes that the shared thread has yet to add
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
@@ -237,31 +228,27 @@ class Receiver:
             self.resume(intake)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` for frames or an error in any intake.
-
-        Only one thread may call this method.
-        """
+        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait."""
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
 
     def resume(self, intake: Intake) -> None:
-        """Resume reception on a port that has failed and been reopened. Any thread may call this method."""
+        """Resume reception from a port that has been reopened after a failure. Any thread may call this."""
         if intake.port.pollable:
             intake.resume()
             self._joining.append(intake)
             return
         if intake in self._alone:
-            # The old thread ends because of the error, so the error must not be cleared before the thread has
-            # ended.
+            # The error makes the old thread end, so it must not be cleared before.
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = clock.thread(target=self._receive_alone, args=(intake,), name=name)
         thread.start()
-        self._alone[intake] = thread  # after start(), because close() joins all threads in this table
+        self._alone[intake] = thread  # not before start(), because close() joins these threads
 
     def close(self) -> None:
-        """End and join the receiving threads, without closing the ports."""
+        """Stop the receiving threads. The ports stay open."""
         self._stop.set()
         for thread in self._alone.values():
             thread.join()
@@ -288,7 +275,7 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _receive_batch(self, shared: _Shared) -> None:
-        """Wait for frames on all shared ports, fetch them, and pause."""
+        """Wait for frames from the shared ports, fetch them, and pause."""
         intakes = shared.intakes
         if self._joining:
             while self._joining:
@@ -321,7 +308,7 @@ class Receiver:
             try:
                 if self._stop.is_set() or intake.failed:
                     return
-                # Fetch twice: frames may have arrived while this thread was suspended.
+                # After a time-out, fetch once more: frames may have arrived while the thread was suspended.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
                     self._notify()
                     if intake.port.reads_batches:
@@ -333,25 +320,25 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _notify(self) -> None:
-        if self._news.empty():  # a single notification is enough for all intakes
+        if self._news.empty():  # one notification serves all intakes
             self._news.put(None)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
-    """Fetch frames for all ``intakes``, and return whether any intake has new frames or an error."""
+    """Fetch frames for all ``intakes``. Return whether there are new frames or an error."""
     return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would stop at the first success
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
-    """Return the end (ns) of a pause that lasts 0.5 to 1.5 times ``pause_ns``.
+    """Return the end of a pause of 0.5 to 1.5 times ``pause_ns``, ns.
 
-    Pauses end at multiples of ``pause_ns``, so that all buses are read at the same time.
+    All pauses end at multiples of ``pause_ns``, so that all buses are read at the same time.
     """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
 
 def _before(t_ns: int, now_ns: int) -> int:
-    """Return the time (ns) at which to fetch a frame that is predicted to arrive at ``t_ns``."""
+    """Return the time of the next fetch if a frame is predicted to arrive at ``t_ns``, ns."""
     due_ns = t_ns + _LAG_NS
     if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
         due_ns -= _BEFORE_NS
@@ -361,13 +348,13 @@ def _before(t_ns: int, now_ns: int) -> int:
 def _poll_of(intakes: Iterable[Intake]) -> select.poll:
     poll = select.poll()
     for intake in intakes:
-        with contextlib.suppress(ValueError):  # the port is closed; the next fetch reports the error
+        with contextlib.suppress(ValueError):  # a closed port; the next fetch reports it
             poll.register(intake.port.fileno(), select.POLLIN)
     return poll
 
 
 def drain(port: CanPort, within_s: float) -> list[Frame]:
-    """Return all frames that arrive within ``within_s``. The port must not have a receiving thread."""
+    """Return all frames that arrive within ``within_s``. No other thread may receive from the port."""
     frames: list[Frame] = []
     end_ns = clock.monotonic_ns() + int(within_s * 1e9)
     while (left_ns := end_ns - clock.monotonic_ns()) > 0:

@@ -1,7 +1,7 @@
-"""Receive many socket messages with one call of recvmmsg(2), which Python's socket module lacks.
+"""Reception of many socket messages with one call of recvmmsg(2), which Python's socket module lacks.
 
-The call never waits and takes only about 1 µs per message, so it does not release the global interpreter lock
-(GIL). Releasing the GIL for each message would cause longer delays in other threads.
+The call does not wait and takes about 1 µs per message, so it keeps the global interpreter lock (GIL).
+Releasing the GIL for each message would delay other threads longer than that.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class _Iovec(ctypes.Structure):
 
 
 class _Head(ctypes.Structure):
-    """C structure ``msghdr`` from <sys/socket.h>."""
+    """struct msghdr of <sys/socket.h>."""
 
     _fields_ = (
         ("name", ctypes.c_void_p),
@@ -34,7 +34,7 @@ class _Head(ctypes.Structure):
 
 
 class _Message(ctypes.Structure):
-    """C structure ``mmsghdr`` from <sys/socket.h>."""
+    """struct mmsghdr of <sys/socket.h>."""
 
     _fields_ = (("head", _Head), ("length", ctypes.c_uint))
 
@@ -48,9 +48,12 @@ _libc: Final = ctypes.PyDLL(None, use_errno=True)
 
 
 class MessageBatch:
-    """Buffers for ``count`` messages of up to ``size`` bytes, each with ``control`` bytes of ancillary data.
+    """Buffers for received messages. Only one thread may use them.
 
-    Owned by one thread.
+    Args:
+        count: Maximum number of messages.
+        size: Maximum length of a message, bytes.
+        control: Maximum length of the ancillary data of a message, bytes.
     """
 
     def __init__(self, count: int, size: int, control: int) -> None:
@@ -68,17 +71,17 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most`` messages without waiting, and discard the previous messages.
+        """Replace the messages in the buffers by up to ``most`` new messages, without waiting.
 
         Returns:
             Number of messages received.
 
         Raises:
-            OSError: if receiving fails. Messages received before the error are returned first, and the next
-                call raises the error.
+            OSError: if receiving fails. If some messages were received before the error, only the next call
+                raises it.
         """
         used = self._got * _USED.size
-        # The kernel has replaced the buffer sizes by the sizes of the messages, so restore them.
+        # Restore the buffer lengths, which the kernel has overwritten with the lengths of the messages.
         self._memory[:used] = self._fresh[:used]
         self._got = 0
         got = _libc.recvmmsg(sock.fileno(), self._messages, min(most, self._count), socket.MSG_DONTWAIT, None)
@@ -91,14 +94,14 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield the length of the ancillary data and the length of the data of each message, bytes."""
+        """Yield, for each message, the length of its ancillary data and the length of its data, bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
-        """Return the memory that contains the received messages.
+        """Return the memory of the received messages.
 
-        Each message occupies a record of fixed size, which contains the padded data and then the padded
-        ancillary data.
+        Each message occupies a record of fixed length: its data, padded to ``size`` bytes, and its ancillary
+        data, padded to ``control`` bytes.
         """
         return self._room[: self._got * self._record]
 

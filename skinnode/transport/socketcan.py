@@ -1,8 +1,8 @@
-"""Read batches of frames from a raw SocketCAN socket, with kernel timestamps and the kernel's drop counter.
+"""Batched reception from a raw SocketCAN socket, with kernel timestamps and the kernel's drop counter.
 
-python-can opens and configures the socket and sends frames. Frames are not received with python-can, because
-it makes two system calls per frame and ignores the drop counter. Structures and constants are defined in
-<linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
+python-can opens the socket and sends frames. It is not used to receive frames, because it makes two system
+calls per frame and ignores the drop counter. Structures and constants are from <linux/can.h>,
+<linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
 """
 
 from __future__ import annotations
@@ -28,39 +28,37 @@ _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1
 
 HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; then 8 or 64 data bytes
 FD_MTU: Final = 72
-"""Size of struct canfd_frame, bytes; a classic CAN frame is shorter."""
-_STAMPS: Final = struct.Struct("@qqqqqq")  # s and ns of three timestamps: software, unused, hardware
+"""Size of struct canfd_frame, bytes. Struct can_frame is shorter."""
+_STAMPS: Final = struct.Struct("@qqqqqq")  # three timestamps in s and ns: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
-_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that contain only timestamps
+_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # length of ancillary data with timestamps only
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
-"""Usual memory layout of a received CAN frame: identifier, length, 8 data bytes, software and hardware
-times."""
+"""Usual layout of a received frame in memory: identifier, length, 8 data bytes, software and hardware
+timestamps."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _OLDEST_NS: Final = 10_000_000_000
-"""Maximum age of a received frame, ns. If the wall clock was set after a frame had arrived, the frame can
-appear older. The timestamp of such a frame is replaced by the time of reading."""
+"""Maximum plausible age of a frame, ns. If the wall clock was set after a frame had arrived, the frame seems
+older, and its timestamp is replaced by the time at which it is read."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum time by which a frame's timestamp may be later than the start of reading its batch, ns."""
+"""Maximum plausible time from the reading of a batch to a timestamp in this batch, ns."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames per system call. A fully loaded bus at 1 Mbit/s transmits 256 frames in 30 ms."""
+"""Maximum number of frames per system call; 30 ms of traffic at 1 Mbit/s and full load."""
 
 
 class SocketReader:
-    """Reader that receives batches of frames from a bound SocketCAN socket.
+    """Receives batches of frames from a bound SocketCAN socket. Only one thread may use it.
 
-    Only the receiving thread may use the reader.
-
-    Arrival times are derived from hardware timestamps if the driver provides them (:class:`HardwareDelay`).
+    Arrival times are based on hardware timestamps if the driver provides them (:class:`HardwareDelay`).
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -68,29 +66,29 @@ class SocketReader:
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
-        """Number of frames dropped because the socket's receive buffer was full."""
+        """Number of frames dropped because the receive buffer was full."""
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
-        """Whether the most recent frame had a hardware timestamp."""
+        """Whether the last frame had a hardware timestamp."""
         self._delay = HardwareDelay()
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0
-        )  # enabled by python-can, but a socket supports only one kind of timestamp
+        )  # python-can enables these timestamps, but a socket supports only one kind
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPING, _RX_SOFTWARE | _SOFTWARE | _RX_HARDWARE | _RAW_HARDWARE
         )
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor, or -1 if the socket is closed."""
+        """Return the file descriptor of the socket, or -1 if it is closed."""
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return all frames that have arrived. If there are none, wait for the next frame.
+        """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
             timeout_s: Maximum time to wait for a frame, s.
-            most: Maximum number of frames to return, at most :data:`BATCH_FRAMES`.
+            most: Maximum number of frames, up to :data:`BATCH_FRAMES`.
 
         Raises:
             OSError: if the interface fails.
@@ -107,7 +105,7 @@ class SocketReader:
         earliest_ns, latest_ns = now_ns - _OLDEST_NS, now_ns + _NEWEST_NS
         second = second_ns = 0
         frames: list[Frame] = []
-        new = tuple.__new__  # Frame.__new__ would take twice as long
+        new = tuple.__new__  # half the time of Frame.__new__
         for (control, length), record in zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True):
             word, size, data, seconds, nanoseconds, hardware_s = record
             if control == _STAMPED_BYTES and not hardware_s:
@@ -130,7 +128,7 @@ class SocketReader:
         return frames
 
     def _arrival(self, control: bytes, now_ns: int, wall_to_mono_ns: int) -> int:
-        """Return the monotonic arrival time (ns) of a frame, given its ancillary data."""
+        """Return the arrival time of a frame on the monotonic clock (ns) from its ancillary data."""
         t_ns, at = now_ns, 0
         while at < len(control):
             length, _, kind = _CONTROL.unpack_from(control, at)
@@ -151,10 +149,10 @@ class SocketReader:
 
 
 def set_link_bitrate(config: BusConfig) -> None:
-    """Take a CAN interface down, set its bit rates and bring it up again, using ``ip link``.
+    """Set the bit rates of a CAN interface with ``ip link``. The interface is down in the meantime.
 
     Raises:
-        BusError: if an ``ip link`` command fails. The message contains the command's error output.
+        BusError: if ``ip link`` fails. The message contains its error output.
     """
     rates = ["bitrate", str(config.bitrate_bps)]
     if config.fd:
@@ -179,26 +177,25 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 
 
 class HardwareDelay:
-    """Converts a CAN controller's hardware timestamps to the monotonic clock.
+    """Converts hardware timestamps of a CAN controller to the monotonic clock. Only one thread may use it.
 
-    The converted timestamps are accurate even if the kernel timestamps a frame late. A kernel timestamp is
-    never early, so each frame provides an upper bound on the difference between the two clocks. The estimate
-    of this difference follows the lowest bounds, and rises no faster than two clocks can drift apart. Owned
-    by one thread.
+    The kernel may timestamp a frame late, but never early. The difference between the kernel timestamp and
+    the hardware timestamp of a frame is therefore an upper bound on the offset between the two clocks. The
+    estimated offset follows the lowest bounds, and rises no faster than two clocks can drift apart.
     """
 
-    DRIFT: Final = 200e-6  # maximum relative drift of two oscillators with a tolerance of 100 ppm each
+    DRIFT: Final = 200e-6  # two oscillators with a tolerance of 100 ppm each
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
         self._last_ns = 0
 
     def arrival_ns(self, hardware_ns: int, kernel_ns: int) -> int:
-        """Return the monotonic arrival time of a frame, ns.
+        """Return the arrival time of a frame on the monotonic clock, ns.
 
         Args:
-            hardware_ns: Timestamp from the controller, ns.
-            kernel_ns: Timestamp from the kernel, converted to the monotonic clock, ns.
+            hardware_ns: Hardware timestamp, ns.
+            kernel_ns: Kernel timestamp, converted to the monotonic clock, ns.
         """
         offset_ns = kernel_ns - hardware_ns
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) < _OLDEST_NS:

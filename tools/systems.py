@@ -1,9 +1,9 @@
 """Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom problems: ``python -m tools.systems``.
 
-All solvers are given the same functions, a tolerance of 1e-12 and at most 2000 evaluations. They start from
-the standard starting points multiplied by 1, 10 and 100. A square system with a root counts as solved if the
-final point is a root, any other system if it is a minimum of the residual norm. Both are verified in 80-bit
-arithmetic, whatever status the solver reports.
+All solvers are given the same functions, a tolerance of 1e-12 and at most 2000 evaluations. The solvers start
+from the standard starting points multiplied by 1, 10 and 100. A square system with a root counts as solved if
+the final point is a root, any other system if it is a minimum of the residual norm. Roots and minima are
+verified in 80-bit arithmetic, whatever status the solver reports.
 
 A solver makes a false claim if it reports success at a point that is neither a root nor a minimum, or if it
 reports a root of a square system at a point that is only a minimum.

@@ -30,10 +30,10 @@ SDO_SHARE: Final = 0.01
 """Fraction of the bandwidth reserved for SDO: one request and one response every 27 ms at 1 Mbit/s."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""Specified maximum delay from SYNC to the first chunk, s, of a node on an otherwise idle machine."""
+"""Maximum delay from SYNC to the first chunk, s, as specified for a node on an otherwise idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Specified maximum deviation of a chunk from its scheduled time, s, on an otherwise idle machine."""
+"""Maximum deviation of a chunk from its scheduled time, s, as specified for an otherwise idle machine."""
 
 _SAMPLES: Final = 512
 """Number of random frames from which the mean frame length is estimated, to a standard error of 0.1 bits."""

@@ -2,12 +2,12 @@
 
 The method is that of section 3 in Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability
 analysis: Refuted, revisited and revised", Real-Time Systems 35, 2007. The frame with the lowest identifier
-wins arbitration, and a transmission is never preempted. Since the first instance of a message is not always
-the slowest, the analysis examines every instance in the longest busy period of the message's priority level.
+wins arbitration, and a transmission is never preempted. The first instance of a message is not always the
+slowest, so the analysis examines every instance in the longest busy period of the message's priority level.
 
 This module extends the analysis to messages sent in bursts, such as the chunks of a scan: each period begins
-with ``count`` frames at intervals of ``spacing_ns``. A time window contains most frames if it begins with a
-burst; this number replaces the paper's ⌈(t + J) / T⌉.
+with ``count`` frames at intervals of ``spacing_ns``. A time window contains the largest number of frames if
+it begins with a burst; this number replaces the paper's ⌈(t + J) / T⌉.
 
 Two assumptions apply: no frame is retransmitted after an error, and every controller sends its
 highest-priority frame first.
@@ -38,7 +38,7 @@ class Message:
     spacing_ns: int = 0
     """Minimum time between consecutive frames of a burst, ns."""
     jitter_ns: int = 0
-    """Maximum queueing jitter of a frame, ns. It does not change the order of the frames."""
+    """Maximum queueing jitter of a frame, ns. The jitter does not change the order of the frames."""
 
     def __post_init__(self) -> None:
         for name, least in (

@@ -127,7 +127,8 @@ def classic_frame_bits(head: int, data: bytes) -> int:
     Returns:
         Number of bits, including stuff bits and inter-frame space.
     """
-    # The data are passed in two halves, because numba would compile the kernel again for numbers from 2⁶³.
+    # The data are passed in two halves, because numba would compile the kernel again for numbers of 2⁶³ or
+    # more.
     word = int.from_bytes(data, "big")
     return int(_classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, *_arrays()))
 
@@ -172,8 +173,8 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # Six filler bits make five whole bytes of the 19-bit head and the 15-bit CRC. Because the head ends
-        # inside a byte, each byte to be stuffed is assembled from two adjacent payload bytes.
+        # The 19-bit head, the 15-bit CRC and six filler bits make up five bytes. Because the head ends inside
+        # a byte, each byte to be stuffed is assembled from two adjacent payload bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0

@@ -7,14 +7,15 @@ followed by a stuff bit of the opposite value. A stuff bit can be the first of t
 
 CRC and stuff bits are looked up in tables, one byte at a time, so leading filler bits pad the head of a frame
 to whole bytes. For the CRC, the filler bits are zeros, which leave the initial value of 0 unchanged. For
-stuffing, they alternate and end with a 1, so that the dominant start of frame begins a new run.
+stuffing, the filler bits alternate and end with a 1, so that the dominant start of frame begins a new run.
 
 The CAN FD frames of a hand have 11-bit identifiers and switch the bit rate; only :func:`exact_fd_bits`
-supports others. The stuffing rule of classic CAN applies up to the end of the data. The CRC field contains a
-4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one before the first
-bit and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit rate, all
-others at the nominal bit rate: the 17 bits before ESI (36 with a 29-bit identifier) and the 12 bits after the
-CRC delimiter (ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space).
+supports other CAN FD frames. In CAN FD, the stuffing rule of classic CAN applies up to the end of the data.
+The CRC field contains a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff
+bits: one before the first bit and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at
+the data bit rate, all others at the nominal bit rate: the 17 bits before ESI (36 with a 29-bit identifier)
+and the 12 bits after the CRC delimiter (ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame
+space).
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum number of bits, with a stuff bit after the first 5 bits and after every 4 more.
+    """Return the maximum number of bits in a frame: a stuff bit follows the first 5 bits and every 4 more.
 
     Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -368,7 +369,7 @@ class BusLoad:
 def _packed(
     ids: list[int], data: list[bytes]
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable arrays.
+    """Return the identifiers (n,), the lengths (n,) and the concatenated data as arrays.
 
     The arrays are writable copies, because numba would compile the kernels again for read-only arrays.
     """

@@ -33,7 +33,7 @@ def find_buses(
     hand: Path | None,
     bus: str | None,
 ) -> list[Place]:
-    """Return the bus that the options specify, or every bus of the hand without ``--bus``.
+    """Return the bus that the options specify or, without ``--bus``, every bus of the hand.
 
     Args:
         interface: Value of ``--interface``.

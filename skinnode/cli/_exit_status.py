@@ -11,9 +11,9 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-A command stopped by a signal prints nothing, because the signal was sent on purpose. It closes open resources
-before it exits. SIGHUP stays ignored if it was ignored at the start, as under nohup. This module imports only
-fast modules, so that its handlers are installed before the others are loaded.
+A command stopped by a signal prints nothing, because the signal was sent on purpose. The command closes open
+resources before it exits. SIGHUP stays ignored if it was ignored at the start, as under nohup. This module
+imports only modules that load fast, so that its handlers are installed before the others are loaded.
 """
 
 from __future__ import annotations

@@ -63,9 +63,9 @@ def final_state_text(plan: HandConfig) -> str:
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
-    A node whose computer is too slow skips scans and sends EMCY 0x8110. Its missing and late frames are then
-    reported as notes, not as faults, and so is an EMCY 0x8110 that is still active at the end. Wrong frames
-    remain faults.
+    A node whose computer is too slow skips scans and sends EMCY 0x8110. The missing and late frames of such a
+    node are reported as notes, not as faults, and so is an EMCY 0x8110 that is still active at the end. Wrong
+    frames remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -229,7 +229,7 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    """Return a percentile, ms, of sorted times, s; None if there are none."""
+    """Return a percentile (ms) of sorted times (s); None if there are no times."""
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
 
 
@@ -282,7 +282,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Describe the doubts about a trusted field: that it is imprecise, or has faulty readings."""
+    """Describe whether a field is imprecise, and how many faults its readings have; may be empty."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} in the readings; the affected readings are excluded"

@@ -1,7 +1,7 @@
 """Entry point of ``skinnode``.
 
-This module imports only fast modules, so that signal handlers are installed first. The subcommands are in
-:mod:`skinnode.cli._app`, the exit statuses in :mod:`skinnode.cli._exit_status`.
+This module imports only modules that load fast, so that signal handlers are installed first. The subcommands
+are in :mod:`skinnode.cli._app`, the exit statuses in :mod:`skinnode.cli._exit_status`.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ Line = list[Segment]
 # Five points of matplotlib's colour map "magma" (CC0). Its perceived brightness increases uniformly.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
-"""Number of shades. More would look the same but take longer to draw and to transmit."""
+"""Number of shades. More shades would look the same but take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
 """Shade of pixels whose depth is unknown."""
 _SIGNS: Final = "·:-=+*#%@"
@@ -50,7 +50,7 @@ _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Lower limit of the depth at full brightness, m; below it, noise would look like a touch."""
+"""Minimum depth at full brightness, m. With a smaller minimum, noise would look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
 """Time for which a press that has ended still affects the brightness scale, ns."""
 
@@ -140,7 +140,7 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Brightness scale of the maps; full brightness is the depth of recent presses, rounded up.
+    """Brightness scale of the maps; full brightness is the depth of the deepest recent press, rounded up.
 
     All patches share one scale, so that their maps are comparable.
     """

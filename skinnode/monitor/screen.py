@@ -17,7 +17,7 @@ from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
-"""Minimum size of the screen, in characters; a smaller screen shows only the size required."""
+"""Minimum size of the terminal, in characters; a smaller terminal shows only the required size."""
 
 
 def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Return a text about the chunks, summaries and scans lost on a bus; empty if there are none."""
+    """Describe the chunks, summaries and scans lost on a bus; empty if there are none."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),

@@ -56,7 +56,7 @@ class Recording:
 class Source(Protocol):
     """Protocol implemented by the monitor's data sources.
 
-    All methods but record and stop_recording return immediately.
+    All methods return immediately, except record and stop_recording.
     """
 
     hand: HandConfig
@@ -261,7 +261,7 @@ class ReplaySource:
                 pass
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # report unexpected exceptions to the user, too
+        except Exception as error:  # also report unexpected exceptions to the user
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:

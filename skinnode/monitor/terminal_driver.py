@@ -25,7 +25,7 @@ _END_S: Final = 1.0
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    It bypasses ``sys.stdout``: a blocked write would hold the lock of ``sys.stdout``, for which the
+    The thread bypasses ``sys.stdout``: a blocked write would hold the lock of ``sys.stdout``, for which the
     interpreter waits at exit.
     """
 

@@ -140,7 +140,7 @@ def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | Non
 
 
 def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) -> list[Line]:
-    """Place blocks of lines side by side; a block is given with its width."""
+    """Place blocks of lines side by side. Each block is paired with its width."""
     return [
         [
             segment

@@ -93,7 +93,7 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Highest rate of fields among the patches, Hz; equal to the SYNC rate if no scan is lost."""
+    """Fields per second from the fastest patch; equal to the SYNC rate if no scan is lost."""
     fields_hz: float
     """Fields per second, summed over all patches."""
     latency_s: float | None
@@ -145,7 +145,7 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
     Args:
         hand: The hand.
         history: Snapshots, oldest first; rates are averages over the whole history.
-        live: Whether the source is a running host, the only kind with latencies.
+        live: Whether the source is a running host; a recording has no latencies.
     """
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)

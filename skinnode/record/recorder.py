@@ -35,7 +35,7 @@ A crash of this process costs the recording at most its last 0.25 s.
 """
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s. A power failure costs the recording about its last second. Each call
+"""Interval between fsync calls, s. A power failure costs the recording about its last second. Each fsync call
 blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
@@ -100,10 +100,10 @@ class Recorder:
             ...
 
     If recording begins before the host starts, a replay reproduces the fields bit for bit. A recording that
-    begins later (:meth:`Host.tap`) lacks the initial state of the solvers. If an exception ends the ``with``
-    block before the first frame, the empty recording is deleted. If the disk fails, recording ends with a log
-    message and the host continues. An entry whose writing raises any exception but OSError is lost and
-    counted in ``dropped``.
+    begins while the host is running (:meth:`Host.tap`) lacks the initial state of the solvers. If an
+    exception ends the ``with`` block before the first frame, the empty recording is deleted. If the disk
+    fails (OSError), recording ends with a log message and the host continues. If writing an entry raises any
+    other exception, the entry is lost and counted in ``dropped``.
 
     Args:
         hand: The hand.

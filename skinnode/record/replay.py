@@ -1,6 +1,6 @@
 """Replays a recording and solves its scans with the code that decodes live frames.
 
-Dispatcher, assembler, decoder, stream, solver and publisher are those of the host, but run in a single
+The dispatcher, assembler, decoder, stream, solver and publisher are those of the host, but run in a single
 thread: each scan is solved when its last frame is dispatched.
 
 The fields are identical to those of the live run, bit for bit, on these conditions:
@@ -10,8 +10,8 @@ The fields are identical to those of the live run, bit for bit, on these conditi
 - no live solve was cut short by its deadline.
 
 Times refer to the clock of the recording host, with the 1 µs resolution of log files. If frames are missing
-or damaged, the frame counts in the journal no longer match the log. From then on, the times of the frames
-determine when journal events take effect and when incomplete scans time out.
+or damaged, the frame counts in the journal no longer match the log. The times of the frames then determine
+when journal events take effect and when incomplete scans time out.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Replay:
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
-        """Whether the recording was closed properly, not cut off by the end of its process."""
+        """Whether the recording was closed properly; False if its process was killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None

@@ -2,8 +2,8 @@
 
 NEW defaults to the working tree. The old commit generates the inputs: recordings of simulated hands, and
 streams of resistances for five layouts and two noise levels, with and without faults. Both commits process
-these inputs. They compute the forward model and the fields of every tracker method and path operator, replay
-the recordings, and generate files such as EDS files.
+these inputs. The results are the forward model, the fields of every tracker method and path operator, the
+replayed recordings, and generated files such as EDS files.
 
 The results are divided into parts. For each part, the report gives the hash of each commit's results, and the
 largest relative difference in each array that differs.
@@ -53,7 +53,7 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 def relative_difference(old: Any, new: Any) -> float:
     """Return the largest difference between two arrays, relative to the largest finite value of ``old``.
 
-    It is inf if the arrays do not contain floats or differ in shape, type or non-finite values.
+    The result is inf if the arrays do not contain floats or differ in shape, type or non-finite values.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":
         return np.inf

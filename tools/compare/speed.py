@@ -69,7 +69,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         trees = [tree_of(options.old, folder / "old"), tree_of(options.new, folder / "new")]
-        for tree in trees:  # fills the cache of compiled kernels
+        for tree in trees:  # this run only fills the cache of compiled kernels
             run(tree, options.benchmark, arguments, folder / "out.json")
         best: list[dict[str, float]] = [{}, {}]
         for turn in range(options.rounds):

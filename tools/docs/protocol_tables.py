@@ -28,11 +28,11 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 in most objects. The tables omit it, because its value follows from the other
-sub-indices."""
+"""Name of sub-index 0 in most objects. The tables omit this sub-index, because its value follows from the
+others."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of similar entries that are given a row each; more than that share one row."""
+"""Maximum number of similar entries that have one row each; a larger number shares one row."""
 
 
 def cob_ids() -> str:

@@ -1,8 +1,8 @@
 """Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
 The mutation operators are those of cosmic-ray. Places in the source are drawn with equal probability, then
-one mutation for each place. A draw from all mutations would select a ``+``, which has eleven, eleven times as
-often as a ``not``, which has one.
+one mutation for each place. If mutations were drawn directly, a ``+``, to which eleven apply, would be drawn
+eleven times as often as a ``not``, to which one applies.
 
 A mutant is identified by its file, function and operator and by the text before and after the change, so a
 list of mutants remains valid when code moves. Places are ranked by a hash of the seed and of their source

@@ -68,8 +68,8 @@ class BusConfig(Table):
     """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
     the patches and read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
-    """Node-ID in the heartbeat that the host sends as master. The patches monitor the host's heartbeat and go
-    pre-operational when it stops. If the node-ID is None, the host sends no heartbeat."""
+    """Node-ID of the heartbeat that the host sends as master. The patches monitor this heartbeat and enter
+    pre-operational when it stops. If None, the host sends no heartbeat."""
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number greater than 0 and at most 1")
     ] = MAX_BUS_LOAD
@@ -98,15 +98,15 @@ class SyncConfig(Table):
         Field(ge=0, le=240),
         Allowed("an integer from 2 to 240; or 0 if the host is a guest on all buses"),
     ] = 240
-    """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. If the SYNC of
-    another master has no counter, the value is 0, and each patch numbers its own scans."""
+    """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. The value must be
+    0 if another master sends SYNC without a counter; each patch then numbers its own scans."""
     stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a delay of at least 0 ms")] = 0.0
-    """Delay from the SYNC on one bus to the SYNC on the next bus, milliseconds, if the host is the master. If
-    the delay is 0, the scans on all buses end at the same time, and some must wait to be solved."""
+    """Delay between the SYNCs on successive buses of which the host is the master, milliseconds. With a delay
+    of 0, the scans on all buses end at the same time, and some must wait for a solver."""
 
     @property
     def stagger_s(self) -> float:
-        """Delay from the SYNC on one bus to the SYNC on the next bus, s."""
+        """Delay between the SYNCs on successive buses, s."""
         return self.stagger_ms * 1e-3
 
     @property
@@ -122,9 +122,9 @@ class BringUpConfig(Table):
     """Action if a patch does not answer at start-up. With ``refuse``, the host does not start the hand. With
     ``wait``, the host starts the other patches and waits for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host configures this period in the nodes. A guest that
-    sends nothing assumes that the nodes already use this period. At a period of 250 ms, a
-    lost node is detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
+    """Heartbeat period of the nodes, milliseconds. The host writes this period to the nodes; a guest that
+    sends nothing assumes that they already use it. With a period of 250 ms, a lost node is detected within a
+    second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
 
     @property
     def heartbeat_s(self) -> float:

@@ -28,9 +28,9 @@ MOST_BUSES: Final = 64
 class HandConfig(Table):
     """Configuration of a hand: its buses and patches, and the settings of the host.
 
-    A duplicate name, node-ID or serial number, an unknown bus, an impossible geometry or a conflict with the
-    role of a bus causes a ConfigError. Pydantic wraps the ConfigError in a ValidationError;
-    :func:`parse_hand` unwraps the ConfigError. The bus load is checked separately, by
+    Names, node-IDs and serial numbers must be unique, the bus of each patch must exist, each geometry must be
+    possible, and no setting may conflict with the role of a bus; otherwise a ConfigError is raised. Pydantic
+    wraps it in a ValidationError, which :func:`parse_hand` unwraps. The bus load is checked separately, by
     :func:`skinnode.bus_load.plan.check_plan`.
     """
 

@@ -118,7 +118,7 @@ def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
 
 
 class CalibrationConfig(Table):
-    """Measured properties of a patch, except those with their own keys: baseline and resistivity."""
+    """Measured properties of a patch; baseline and resistivity have keys of their own."""
 
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
@@ -148,9 +148,9 @@ class CalibrationConfig(Table):
 class TolerancesConfig(Table):
     """Manufacturing tolerances of a patch, which are included in the reported standard deviations.
 
-    The text `"ordinary"` selects the defaults below; `"exact"` selects a patch without deviations from its
-    layout, such as a simulated patch. Of the solver methods, only `posterior` includes tolerances in its
-    standard deviations; `exact` ignores tolerances. If a patch has tolerances, `auto` selects `posterior`.
+    `"ordinary"` stands for the defaults below, `"exact"` for a patch that matches its layout exactly, such as
+    a simulated patch. The solver method `posterior` includes tolerances in its standard deviations; `exact`
+    ignores them. If a patch has tolerances, `auto` selects `posterior`.
     """
 
     placement: _Tolerance = ORDINARY.placement
@@ -220,9 +220,9 @@ class PatchConfig(Table):
     tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (
         TolerancesConfig()
     )
-    """Manufacturing tolerances: `"ordinary"` (the default) for a patch made in a good workshop, `"exact"` for
-    a simulated patch, or a table of numbers. Calibration values do not describe the geometry, so they do not
-    replace tolerances."""
+    """Manufacturing tolerances: `"ordinary"` (the default) for a carefully manufactured patch, `"exact"` for
+    a simulated patch, or a table of numbers. A calibration does not replace tolerances, because it does not
+    cover the geometry."""
 
     @field_validator("eds", "baseline")
     @classmethod

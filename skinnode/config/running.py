@@ -21,7 +21,7 @@ class SolverConfig(Table):
     """Solver method: ``exact`` inverts the model of each wire, ``posterior`` estimates the whole patch, and
     ``auto`` selects one of these two according to the layout and the noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
-    """Type of solver step that the method ``exact`` uses."""
+    """Operator that computes the steps of the method ``exact``."""
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m; the method ``exact`` uses it to compute forces. The
     calibration of a patch can override this stiffness."""
@@ -42,16 +42,16 @@ class SolverConfig(Table):
         Field(gt=0, le=1, allow_inf_nan=False),
         Allowed("a number greater than 0 and at most 1 (m)"),
     ] = None
-    """A field is precise only if no displacement has a standard deviation above this limit, metres. If
-    None, the limit is derived from the layout and the noise."""
+    """Maximum standard deviation of the displacements in a precise field, metres. If None, the limit is
+    derived from the layout and the noise."""
     max_force_std_n: Annotated[
         float | None,
         Field(gt=0, le=1e6, allow_inf_nan=False),
         Allowed("a number greater than 0 and at most 1e6 (N)"),
     ] = None
-    """A field is precise only if no contact's normal force has a standard deviation above this limit,
-    newtons. If None, the limit is derived from the layout and the properties of the rubber, and applies only
-    to calibrated forces."""
+    """Maximum standard deviation of the normal forces of contacts in a precise field, newtons. If None, the
+    limit is derived from the layout and the properties of the rubber, and applies only to calibrated
+    forces."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel. If None, the host uses one thread per core, but at
     most one per patch."""
@@ -61,9 +61,8 @@ class StreamConfig(Table):
     """Settings for delivering scans and fields to programs."""
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
-    """Handling of incomplete scans: scans with missing chunks or a missing summary. ``pass`` delivers
-    incomplete scans unchecked, together with a mask of the valid resistances; ``withhold`` does not deliver
-    incomplete scans. Incomplete scans are counted in either case."""
+    """Treatment of scans with missing chunks or without a summary: ``pass`` delivers them unchecked, with a
+    mask of the valid resistances; ``withhold`` does not deliver them. They are counted in either case."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
     """Maximum number of fields in a subscriber's queue; if the queue is full, the oldest field is dropped.
     At 12.5 scans per second, four patches fill the default queue of 64 fields in 1.3 s."""

@@ -27,7 +27,7 @@ class SimulationConfig(Table):
     indenter_radius_m: Length = 0.04
     """Radius of the spherical indenter, metres."""
     depth: Ratio = 0.1
-    """Maximum indentation, as a fraction of the height of the upper electrodes. 0: nothing touches the
+    """Maximum indentation, as a fraction of the height of the upper electrodes. With 0, nothing touches the
     hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3

@@ -83,7 +83,7 @@ def octets_text(data: bytes) -> str:
 
 
 def octets(text: str) -> bytes:
-    """Encode text from :func:`octets_text`. Any other non-ASCII characters become UTF-8."""
+    """Encode text: surrogates become their original bytes, and other non-ASCII characters become UTF-8."""
     return text.encode("utf-8", "surrogateescape")
 
 

@@ -10,7 +10,7 @@ STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
 A node obeys NMT commands in every state except INITIALISING. *Reset node* (129) sets all objects to their
-power-on values, and *reset communication* (130) only those from 0x1000 to 0x1FFF. The node boots after both.
+power-on values. *Reset communication* (130) sets only those from 0x1000 to 0x1FFF. The node then boots.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ GUARD_TOGGLE: Final = 0x80
 
 
 class NmtState(IntEnum):
-    """NMT states, with their values in heartbeats. A node that is switched off is INITIALISING, too."""
+    """NMT states, with their values in heartbeats. In this project, switched-off nodes are INITIALISING."""
 
     INITIALISING = 0
     STOPPED = 4

@@ -50,7 +50,8 @@ class Guarding:
     def on_written(self, t_ns: int) -> None:
         """Apply a new guard time or life time factor.
 
-        While guarding is active, the node life time restarts. A node life time of 0 ends the error.
+        While guarding is active, the node life time restarts. A node life time of 0 ends a life guarding
+        error.
         """
         if self._guarded or not self._life_ns:
             self._start(t_ns)

@@ -79,7 +79,7 @@ class HeartbeatConsumer:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the first of the expected heartbeats is overdue, ns."""
+        """Earliest time at which a heartbeat is overdue, ns."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property
@@ -93,7 +93,7 @@ class HeartbeatConsumer:
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Apply a write to 0x1016. Only changed entries start again without a received heartbeat."""
+        """Apply a write to 0x1016. Monitoring by a changed entry starts at the next heartbeat."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}

@@ -234,12 +234,12 @@ class ObjectStore:
         self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
 
     def restore(self, first: int, last: int) -> None:
-        """Reset the writable objects from ``first`` to ``last`` to their defaults."""
+        """Reset the writable objects with indices ``first`` to ``last`` to their defaults."""
         for key in self._writable(first, last):
             self._values[key] = self._at_start(self._entries[key])
 
     def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
-        """Return the values from ``first`` to ``last`` that differ from their defaults.
+        """Return the values with indices ``first`` to ``last`` that differ from their defaults.
 
         Only writable objects that are not computed are included.
         """

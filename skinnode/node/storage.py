@@ -68,7 +68,7 @@ class Storage:
 
     @property
     def kept(self) -> Kept:
-        """Content of the memory, without any content that is unusable."""
+        """Content of the memory; empty if the memory has no usable content."""
         return self._kept
 
     @property
@@ -122,7 +122,7 @@ class Storage:
             self._emcy.report_once(EmcyCode.DATA_SET, detail, t_ns)
 
     def restore(self, first: int, last: int) -> None:
-        """Set the objects from ``first`` to ``last`` to their power-on values.
+        """Set the objects with indices ``first`` to ``last`` to their power-on values.
 
         The power-on value is the saved value, or the default if nothing was saved. Saved values pass the same
         checks as values written by a client; a refused value is replaced by the default.

@@ -50,8 +50,8 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Placeholder payload for chunk indices beyond the patch's last chunk. Such an index looks like a repeated
-chunk, so the code that receives chunks need not check the range of each index."""
+"""Placeholder payload for chunk indices beyond the patch's last chunk. An invalid index thus looks like that
+of a repeated chunk, so the range is checked only for repeated chunks."""
 _NONE_OPEN: Final = -1  # scan counters are never negative
 _NEVER: Final = -1
 # Plain ints, because testing an enum flag takes as long as processing a chunk.

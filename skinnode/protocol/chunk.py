@@ -74,7 +74,7 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
 def pack_scan(
     codes: ArrayLike, scan: int, profile: PatchProfile, only: Sequence[int] | None = None
 ) -> list[bytes]:
-    """Pack the codes of a scan into the payloads of its chunks, in order.
+    """Return the payloads of the chunks of a scan, in sending order.
 
     Args:
         codes: (U, K) codes.
@@ -124,7 +124,7 @@ def _empty_chunks(profile: PatchProfile) -> NDArray[np.uint8]:
 
 
 def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
-    """Unpack the (U, K) codes of a scan from the payloads of its chunks.
+    """Return the (U, K) codes of a scan, given the payloads of its chunks.
 
     Args:
         frames: payloads of all chunks in ascending order, concatenated.
@@ -134,7 +134,7 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
 
 def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes, int]:
-    """Unpack the codes of a scan and compute their CRC.
+    """Return the codes of a scan and the CRC over them.
 
     Args:
         frames: payloads of all chunks in ascending order, concatenated.

@@ -50,7 +50,7 @@ class Scan:
 
     @property
     def empty(self) -> bool:
-        """Whether all chunks that the node sent were lost."""
+        """Whether the node sent chunks, but all of them were lost."""
         return self.chunks_received == 0 < self.chunks_expected
 
 

@@ -22,7 +22,7 @@ class BusState(StrEnum):
     WARNING = "error warning"
     """An error counter has reached the warning limit. The controller is still error active."""
     PASSIVE = "error passive"
-    """An error counter has exceeded the error active range. The controller still sends and receives."""
+    """An error counter has reached the error passive limit. The controller still sends and receives."""
     OFF = "bus-off"
     """The controller neither sends nor receives."""
 

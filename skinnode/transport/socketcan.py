@@ -46,7 +46,7 @@ _OLDEST_NS: Final = 10_000_000_000
 older, and its timestamp is replaced by the time at which it is read."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible time from the reading of a batch to a timestamp in this batch, ns."""
+"""Maximum plausible time by which a timestamp is later than the reading of its frame, ns."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""

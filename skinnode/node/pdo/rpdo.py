@@ -83,7 +83,7 @@ class RpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the first of the monitored RPDOs is overdue, ns."""
+        """Earliest time at which a monitored RPDO is overdue, ns."""
         return self._timers.deadline_ns
 
     # --- parameters

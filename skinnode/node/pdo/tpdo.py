@@ -126,7 +126,7 @@ class Owner(Protocol):
     """Part of an application that sends the TPDOs with a claimed object."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether the owner is about to send this TPDO anyway, so that nothing need trigger it."""
+        """Return whether the owner is about to send this TPDO without being triggered."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:

@@ -1,7 +1,7 @@
-"""Bidiagonal form of a small matrix, from which a damped step can be computed in O(n) operations.
+"""Bidiagonal form of a small matrix, for the damped steps of Levenberg-Marquardt.
 
-Levenberg-Marquardt tries several damping parameters per Jacobian. For each damping parameter, the step takes
-O(n) operations with the bidiagonal form, and O(n³) with J itself.
+Levenberg-Marquardt tries several damping parameters per Jacobian. With the bidiagonal form, each of them
+takes O(n) operations instead of O(n³).
 """
 
 from __future__ import annotations
@@ -19,12 +19,19 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 ) -> None:
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
-    ``a`` contains A padded with zeros to (n + 3, m), with m rounded up to whole SIMD vectors. Because of the
-    padding, loops over four rows and whole vectors need no special cases. Writes B to ``diagonal`` (n,) and
-    ``upper`` (n,), whose last element is 0. For the reflectors I − β v vᵀ of Q, writes v to the rows of ``a``
-    and β to ``across`` (n,). For the reflectors of P, writes v to the rows of ``left`` (n, n + 3; padded like
-    ``a``) and β to ``down`` (n,). ``w`` is a scratch array as long as a row of ``a``. The squares of A's
-    elements must not overflow (algorithm: Golub & Van Loan, 5.4.8, rows and columns swapped).
+    The algorithm is that of Golub & Van Loan, 5.4.8, with rows and columns exchanged. The squares of the
+    elements of A must not overflow.
+
+    Args:
+        a: A, padded with zeros to (n + 3, m), m rounded up to whole SIMD vectors. The padding allows loops to
+            process four rows and whole vectors at a time. Overwritten: row k becomes the vector v of
+            the k-th reflector I − β v vᵀ of Q.
+        left: (n, n + 3) output, padded like ``a``: row k is the vector v of the k-th reflector of P.
+        diagonal: (n,) output: diagonal of B.
+        upper: (n,) output: superdiagonal of B, followed by 0.
+        across: (n,) output: factors β of the reflectors of Q.
+        down: (n,) output: factors β of the reflectors of P.
+        w: Scratch, as long as a row of ``a``.
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):
@@ -48,7 +55,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         for j in range(0, column.size, LANES):
             store(column, j, LANES, splat(0.0))
         square = 0.0
-        for i in range(k + 1, n, 4):  # apply the row's reflector and accumulate the column's reflector
+        for i in range(k + 1, n, 4):  # apply the reflector of the row, and accumulate that of the column
             t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
             s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(first, end, LANES):
@@ -102,15 +109,14 @@ def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
 def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     diagonal: Float, upper: Float, b: Float, lam: float, inverse: Float, ru: Float, x: Float
 ) -> None:
-    """Solve [B; √lam I] x = [``b``; 0] in the least-squares sense, with B from :func:`bidiagonalise`.
+    """Solve the least-squares problem [B; √lam I] x = [``b``; 0], with B from :func:`bidiagonalise`.
 
-    Uses Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
-    1977).
-
-    The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes the reciprocal of R's diagonal to ``inverse``
-    (n,) and R's superdiagonal to ``ru`` (n,). The squares of lam and of B must not both underflow.
+    Uses Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares
+    problems, 1977). The factor R of BᵀB + lam I = RᵀR is also bidiagonal: the reciprocals of its diagonal are
+    written to ``inverse`` (n,), and its superdiagonal to ``ru`` (n,). The squares of lam and of B must not
+    both underflow.
     """
-    below, rest = lam, 0.0  # squared element of the damping row below row i of B, and its right-hand side
+    below, rest = lam, 0.0  # squared element of the damping row under row i of B, and its right-hand side
     for i in range(x.size):
         radius = 1.0 / (diagonal[i] * diagonal[i] + below)
         inverse[i] = math.sqrt(radius)
@@ -118,7 +124,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
         c, t = diagonal[i] * inverse[i], root * inverse[i]
         ru[i] = c * upper[i]
         x[i] = c * b[i] + t * rest
-        filled = -t * upper[i]  # fill-in, which is rotated into the next damping row
+        filled = -t * upper[i]  # fill-in, to be rotated into the next damping row
         below = lam + below * radius * (upper[i] * upper[i])
         rest = (c * rest - t * b[i]) * (filled / math.sqrt(below))
     bidiagonal_solve(inverse, ru, x)
@@ -126,7 +132,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
 
 @njit_part
 def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
-    """Replace ``x`` (n,) with R⁻¹ x; R has the diagonal 1 / ``inverse`` and the superdiagonal ``upper``."""
+    """Replace ``x`` (n,) with R⁻¹ x, where R has the diagonal 1 / ``inverse`` and superdiagonal ``upper``."""
     last = 0.0
     for i in range(x.size - 1, -1, -1):
         last = (x[i] - upper[i] * last) * inverse[i]

@@ -1,13 +1,13 @@
 """Dense kernels for a few hundred unknowns: Cholesky factorisation, triangular solves, products.
 
-LAPACK is not used because the last bits of an OpenBLAS result depend on the number of threads, and equal
-frames must give equal fields. These kernels always add the terms of an element in the same order, regardless
-of the number of threads and of how the columns are split.
+Identical frames must yield identical fields, but the last bits of an OpenBLAS result depend on the number of
+threads. These kernels therefore replace LAPACK. They always add the terms of an element in the same order,
+regardless of the number of threads and of how the columns are split.
 
-All kernels share one loop, which keeps a tile of the result (6 rows of 2 vectors) in registers. Each group of
-12 multiply-adds therefore requires only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
-multiplication, 2008). Arrays are C-ordered float64. A buffer may be larger than the problem; the kernels then
-use its leading n rows and columns. No kernel allocates memory.
+The inner loop of all kernels keeps a tile of the result (6 rows of 2 vectors) in registers, so 12
+multiply-adds require only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix multiplication,
+2008). Arrays are C-ordered float64. A buffer may be larger than the problem; the kernels then use its leading
+n rows and columns. No kernel allocates memory.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from skinnode.model.layout import Float
 ROWS: Final = 6
 """Number of rows in a tile.
 
-A tile needs 15 of the 16 AVX2 registers: 12 for sums (2 vectors per row), 2 for loaded vectors and 1 for a
-factor.
+With 6 rows, 15 of the 16 AVX2 registers are in use: 12 for sums (2 vectors per row), 2 for loaded vectors,
+and 1 for a factor.
 """
 TILE: Final = 2 * LANES
 """Number of columns in a tile."""
@@ -35,9 +35,10 @@ TILE: Final = 2 * LANES
 def _tile(  # noqa: PLR0913 - the bounds of a tile
     c: Float, r: int, rows: int, a: Float, b: Float, low: int, high: int, col: int, count: int, subtract: bool
 ) -> None:
-    """Set ``c``[r:r+rows, tile] to Σ_k ``a``[r:r+rows, k] ``b``[k, tile], low ≤ k < high, or subtract it.
+    """Compute Σ_k ``a``[r:r+rows, k] ``b``[k, col:col+count] for low ≤ k < high.
 
-    The tile consists of ``count`` ≤ TILE columns, starting at ``col``; rows ≤ ROWS.
+    The result replaces ``c``[r:r+rows, col:col+count], or is subtracted from it if ``subtract`` is true.
+    rows ≤ ROWS and count ≤ TILE.
     """
     zero = splat(0.0)
     right = col + LANES
@@ -96,7 +97,10 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 def _forward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻¹ B; rows low to r must be complete."""
+    """Replace rows r to r + rows − 1 of a tile of ``b`` with those of L⁻¹ B.
+
+    Rows ``low`` to r − 1 of the tile must already have been replaced.
+    """
     _tile(b, r, rows, l, b, low, r, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -115,9 +119,10 @@ def _forward(  # noqa: PLR0913 - the bounds of a tile
 
 @njit
 def cholesky(a: Float, n: int) -> int:
-    """Replace the symmetric ``a`` (n, n) with its Cholesky factor: L on and below the diagonal, Lᵀ above.
+    """Replace the symmetric matrix ``a`` (n, n) with its Cholesky factor.
 
-    Reads only the diagonal and the upper triangle. Returns 1, or 0 if ``a`` is not positive definite.
+    Reads only the diagonal and the upper triangle. Writes L on and below the diagonal, and Lᵀ above it.
+    Returns 1, or 0 if ``a`` is not positive definite.
     """
     first: Any = np.int64(0)  # with a literal 0, numba would compile the callee a second time
     for r in range(0, n, ROWS):
@@ -160,7 +165,10 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 def _backward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻ᵀ B; all later rows must be complete."""
+    """Replace rows r to r + rows − 1 of a tile of ``b`` with those of L⁻ᵀ B.
+
+    All later rows of the tile must already have been replaced.
+    """
     _tile(b, r, rows, l, b, r + rows, n, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -213,7 +221,7 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 def solve_positive(a: Float, b: Float, n: int) -> bool:
     """Replace the leading n elements of ``b`` with A⁻¹ b, and the symmetric ``a`` (n, n) with its factor.
 
-    If ``a`` is not positive definite, returns False and does not change ``b``.
+    Returns whether ``a`` is positive definite; if it is not, ``b`` does not change.
     """
     if not cholesky(a, n):
         return False
@@ -260,7 +268,7 @@ def multiply_vector(a: Float, v: Float, out: Float) -> None:
 def inverse_diagonal(l: Float, work: Float, out: Float, n: int) -> None:
     """Write the diagonal of (L Lᵀ)⁻¹ into the leading n elements of ``out``: out_j = Σ_i (L⁻¹)_ij².
 
-    Leaves L⁻¹ in the lower triangle of ``work`` (n, n).
+    Writes L⁻¹ into the lower triangle of ``work`` (n, n).
     """
     for col in range(0, n, TILE):
         count = min(TILE, n - col)

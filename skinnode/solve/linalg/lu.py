@@ -1,9 +1,9 @@
 """LU factorisation of a small square matrix, for the Jacobian of one wire.
 
-LAPACK is not used: with 30 unknowns, a LAPACK call takes longer than the arithmetic itself, and
-``numpy.linalg`` in compiled code adds seconds of compile time. Kernels store and factor Jᵀ, so that every
-inner loop runs along a contiguous row and vectorisation does not reorder sums (Golub & Van Loan, Matrix
-Computations, 4th ed., 3.4).
+These kernels replace LAPACK for two reasons. With 30 unknowns, the overhead of a LAPACK call exceeds the time
+of the arithmetic, and ``numpy.linalg`` in compiled code adds seconds of compile time. The kernels factor Jᵀ,
+so that inner loops run along contiguous rows, and vectorisation does not reorder sums (Golub & Van Loan,
+Matrix Computations, 4th ed., 3.4).
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from skinnode.solve.linalg.vectors import Index
 
 @njit_part
 def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a time
-    """Factor A (n, n) in place with row exchanges in ``pivot`` (n,); return the sign of det A, 0 if singular.
+    """Factor A (n, n) in place; return the sign of det A, or 0 if A is singular.
 
-    ``a`` contains A padded with zeros to (n + 3, n), with n rounded up to whole SIMD vectors. Because of the
-    padding, four rows can be processed at a time, and whole vectors need no special case.
+    Writes the row exchanges to ``pivot`` (n,). ``a`` is A padded with zeros to (n + 3, n), with the number of
+    columns rounded up to whole SIMD vectors. The padding allows the loops to process four rows and whole
+    vectors at a time.
     """
     n, end = pivot.size, a.shape[1]
     sign, top, p = 1, 0.0, 0
@@ -74,7 +75,7 @@ def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a tim
 
 @njit_part
 def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
-    """Solve Aᵀ s = b for the A of :func:`lu_factor`; s replaces ``b`` (n,)."""
+    """Solve Aᵀ s = b, with A factored by :func:`lu_factor`; s replaces ``b`` (n,)."""
     n = b.size
     for i in range(n):
         row = lu[i]
@@ -95,7 +96,7 @@ def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
 
 @njit_part
 def lu_inverse_transposed(lu: Float, pivot: Index, inverse: Float) -> None:
-    """Write (Aᵀ)⁻¹ for the A of :func:`lu_factor` into ``inverse`` (n, n)."""
+    """Write (Aᵀ)⁻¹, with A factored by :func:`lu_factor`, into ``inverse`` (n, n)."""
     n = pivot.size
     for i in range(n):
         row = inverse[i]

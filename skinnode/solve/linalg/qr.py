@@ -1,7 +1,7 @@
-"""Householder QR of a small tall matrix, for the Jacobian of a wire with fewer unknowns than equations.
+"""Householder QR factorisation of a small tall matrix, for wires with more equations than unknowns.
 
-Normal equations are avoided because they square the condition number (Golub & Van Loan, Matrix Computations,
-4th ed., 5.2, 5.3).
+The normal equations would square the condition number (Golub & Van Loan, Matrix Computations, 4th ed., 5.2,
+5.3).
 """
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ from skinnode.solve.linalg.vectors import dot
 
 @njit_part
 def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:  # noqa: C901 - loops
-    """Factor J = ``jt``ᵀ (m, n), m ≥ n, by reflectors; return 0 if R has a zero on its diagonal, else 1.
+    """Factor J = ``jt``ᵀ (m, n), m ≥ n, as Q R; return 1, or 0 if R has a zero on its diagonal.
 
-    Writes R above the diagonal of ``a`` (m, n) and the diagonal of R to ``diagonal`` (n,). Writes the vectors
-    v of the reflectors I − β v vᵀ on and below the diagonal of ``a``, and β to ``beta`` (n,). ``w`` (n,) is
-    scratch.
+    Args:
+        jt: (n, m) transpose of J.
+        a: (m, n) output: R above the diagonal; on and below it, the vectors v of the reflectors I − β v vᵀ
+            of Q.
+        diagonal: (n,) output: diagonal of R.
+        beta: (n,) output: factors β of the reflectors.
+        w: (n,) scratch.
     """
     n, m = jt.shape
     for j in range(n):
@@ -89,7 +93,7 @@ def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float)
     for k in range(n - 1, -1, -1):
         for i in range(m):
             v[i] = a[i, k] if i >= k else 0.0
-        for j in range(k, n):  # reflector k does not affect the rows above k
+        for j in range(k, n):  # reflector k does not change the rows above row k
             row = inverse[j]
             share = beta[k] * dot(row, v)
             for i in range(k, m):

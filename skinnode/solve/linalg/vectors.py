@@ -1,4 +1,4 @@
-"""Vector operations for kernels: sums, norms, and rows padded to whole vector registers."""
+"""Vector operations of the kernels: products, norms, and rows padded to whole SIMD vectors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Index = NDArray[np.int64]
 
 
 def padded(rows: int, size: int) -> Float:
-    """Return a zero array (rows, ≥ size), padded to whole vector registers and aligned to cache lines."""
+    """Return a zero array (rows, ≥ size), aligned to a cache line, with rows padded to whole SIMD vectors."""
     size = -(-size // LANES) * LANES
     room = np.zeros(rows * size + 8)
     first = (-room.ctypes.data // room.itemsize) % 8
@@ -24,7 +24,7 @@ def padded(rows: int, size: int) -> Float:
 
 @njit_part
 def dot(a: Float, b: Float) -> float:
-    """Return a·b; four independent partial sums hide the latency of the multiply-adds."""
+    """Return a·b. Four independent partial sums hide the latency of the multiply-adds."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     whole = a.size - a.size % 4
     for i in range(0, whole, 4):
@@ -50,9 +50,9 @@ def largest(a: Float) -> float:
 
 @njit
 def orthonormalise(rows: Float) -> None:
-    """Orthonormalise linearly independent ``rows`` (r, n) by two passes of modified Gram-Schmidt.
+    """Orthonormalise linearly independent ``rows`` (r, n) by modified Gram-Schmidt with two passes.
 
-    Two passes achieve orthogonality to machine precision (Giraud et al., 2005).
+    The second pass makes the rows orthogonal to machine precision (Giraud et al., 2005).
     """
     for i in range(len(rows)):
         row = rows[i]

@@ -1,7 +1,8 @@
-"""The operators Gauss-Newton, Levenberg-Marquardt and dogleg (one file each), and their workspace ``work``.
+"""Operators that compute the steps of a solve: Gauss-Newton, Levenberg-Marquardt and dogleg.
 
-``trust_region`` decides whether to accept a step, and ``loop`` iterates the operator selected by its number
-in ``codes``. ``system`` contains ``solve_system``, which solves any system with at least as many equations as
-unknowns, in one or more attempts (``attempt``). ``minimum`` tests and refines minima with a non-zero
-residual, and ``result`` defines the returned object.
+Each operator has its own module; they share the workspace in ``work``. ``trust_region`` accepts or rejects a
+step, and ``loop`` iterates one of the operators, selected by its number in ``codes``. ``system`` contains
+``solve_system``, which solves any system with at least as many equations as unknowns, in one or more attempts
+(``attempt``). ``minimum`` tests and refines minima with a non-zero residual. ``result`` defines the result of
+``solve_system``.
 """

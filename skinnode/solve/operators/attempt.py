@@ -1,7 +1,7 @@
-"""One attempt of ``solve_system``: runs one operator with one trust region, and classifies the point reached.
+"""Attempt of ``solve_system``: runs an operator with one initial trust region, and classifies the last point.
 
-The compiled loop stops at roots and near stationary points of ‖r‖. If the loop reports CONVERGED, this module
-decides whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
+The compiled loop reports CONVERGED at roots and near stationary points of ‖r‖. An attempt then decides
+whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ from skinnode.solve.operators.result import PointKind
 from skinnode.solve.operators.work import LIMIT, NORM, workspace
 
 NEAR: Final = 1e-2
-"""Maximum cosine between r and any column of J at which an attempt switches to Newton's method for a minimum.
-Near a minimum with a large residual, the operators themselves converge only linearly: on the problem of Brown
-& Dennis, they take 454 steps."""
+"""Largest cosine between r and a column of J below which an attempt changes to Newton's method for a minimum.
+
+Near a minimum with a large residual, the operators converge only linearly: they take 454 steps on the problem
+of Brown & Dennis.
+"""
 
 
 class System:
-    """Wrapper of the caller's functions that counts their calls and checks their arrays.
+    """Wrapper of the caller's functions that counts the calls and validates the returned arrays.
 
-    The methods may return the caller's array without copying it; the next call may overwrite this array.
+    The returned array can be the caller's own, which the next call may overwrite.
     """
 
     def __init__(
@@ -41,7 +43,7 @@ class System:
         first = residual(x0.copy())
         shape: tuple[int | str, ...] = ("m",)
         if type(first) is np.ndarray and first.ndim == 1 and first.size > 0:
-            shape = first.shape  # for an array of known shape, require_array uses a fast path
+            shape = first.shape  # require_array has a fast path for arrays of a known shape
         self.first = require_array("residual(x0)", first, shape, finite=False).copy()
         self.m = self.first.size
 
@@ -55,20 +57,24 @@ class System:
         self.jacobians += 1
         j, shape = self._jacobian(x.copy()), (self.m, self.n)
         if type(j) is np.ndarray and j.dtype == np.float64 and j.shape == shape:
-            return j  # J is copied, so its memory order does not matter
+            return j  # J will be copied, so its memory order does not matter
         return require_array("jacobian(x)", j, shape, finite=False)
 
     @property
     def steps(self) -> int:
-        """Number of trial points so far: all evaluations of r after the first."""
+        """Number of trial points so far: evaluations of r except the first."""
         return self.evaluations - 1
 
 
 class Attempt:
-    """One attempt to solve a system; an attempt can be paused after any number of steps.
+    """Attempt to solve a system; it can be paused after any number of steps.
 
-    If ``limit`` is 0, the attempt uses Moré's column scaling and initial trust radius. If ``limit`` is
-    negative, the attempt uses D = I and an initial trust radius of −``limit``.
+    Args:
+        code: Operator code.
+        system: The system to solve.
+        start: Starting point.
+        limit: 0 for Moré's column scaling and initial trust radius; a negative value for D = I and an initial
+            trust radius of −``limit``.
     """
 
     def __init__(self, code: int, system: System, start: Point, limit: float) -> None:
@@ -83,7 +89,7 @@ class Attempt:
 
     @property
     def at(self) -> Point:
-        """Best iterate, whose arrays are overwritten when the attempt continues."""
+        """Best iterate. Its arrays are overwritten when the attempt continues."""
         return self._settled or Point(self._w.x, self._w.r, self._w.jt.T)
 
     @property
@@ -98,11 +104,14 @@ class Attempt:
 
     @property
     def decided(self) -> bool:
-        """True if no other attempt is needed: x is a root or minimum, or the equations do not determine x."""
+        """Whether no further attempt is needed.
+
+        This is the case if the start was invalid, or the attempt ended at a root, minimum or flat point.
+        """
         return self.went in (op.CONVERGED, op.INVALID_START) or self.kind in (PointKind.ROOT, PointKind.FLAT)
 
     def run(self, steps: int, tol_f: float, tol_x: float) -> None:
-        """Take at most ``steps`` steps; if the solve ends or approaches a minimum, classify the point."""
+        """Take at most ``steps`` steps; classify the point if the solve ends or approaches a minimum."""
         code, w, system, went, left = self._code, self._w, self._system, self.went, steps
         while went < 0:
             if went == op.TRY:
@@ -122,10 +131,9 @@ class Attempt:
             self.settle(tol_x, left)
 
     def _is_root(self, tol_f: float) -> bool:
-        """Return whether the solve ended at a root.
+        """Return whether the solve ended at a root; estimate the error of x.
 
-        The method also estimates the error of x; if the error is too large, the status becomes
-        ILL_CONDITIONED.
+        If the error is too large, CONVERGED becomes ILL_CONDITIONED.
         """
         w, system = self._w, self._system
         square = system.m == system.n
@@ -138,7 +146,7 @@ class Attempt:
         return self.ended and float(np.abs(w.r).max()) <= tol_f
 
     def settle(self, tol_x: float, steps: int) -> None:
-        """Move to a nearby minimum of ‖r‖ by Newton's method; classify the stationary point."""
+        """Move to a nearby minimum of ‖r‖ by Newton's method, and classify the stationary point reached."""
         at, system, converged = self.at, self._system, self.went == op.CONVERGED
         if converged:
             self.went = op.ILL_CONDITIONED
@@ -151,7 +159,7 @@ class Attempt:
         if minimum:
             self.error = settled.error
         elif converged and settled.at is at:
-            # In a very flat valley, rounding errors exceed the curvature, but J has full rank
+            # In a very flat valley, rounding errors hide the curvature, but J has full rank.
             minimum = abs(settled.lowest) <= CURVED
         if minimum:
             self._settled, self.kind = settled.at, PointKind.MINIMUM

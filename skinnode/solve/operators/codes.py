@@ -1,4 +1,4 @@
-"""Numbers that identify operators and statuses in compiled code, and tolerances for rounding errors."""
+"""Codes of operators and statuses in compiled code, and tolerances for rounding errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
 GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
 LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
 
-# A step returns one of these negative numbers if the solve continues, or a Status (≥ 0) if the solve ends
+# A step returns one of these negative codes if the solve continues, or a Status (≥ 0) if the solve ends
 TRY: Final = -1
 ACCEPTED: Final = -2
 REJECTED: Final = -3
@@ -28,15 +28,14 @@ INVALID_START: Final = int(Status.INVALID_START)
 
 EPS: Final = float(np.finfo(np.float64).eps)
 ROOT_SHARE: Final = EPS ** (1 / 2)
-"""Maximum estimated error of a root x, relative to max(1, ‖x‖∞). An error of √eps means that half of the
-digits of x are correct."""
+"""Maximum estimated error of a root x, relative to max(1, ‖x‖∞). With √eps, half of the digits are
+correct."""
 MINIMUM_SHARE: Final = EPS ** (1 / 3)
-"""Maximum estimated error of a minimum x of ‖r‖, relative to max(1, ‖x‖∞). The limit is larger than that of a
-root, because rounding of ‖r‖² hides relative changes of √eps in x."""
-STATIONARY: Final = 1e-6
-"""Component j of the gradient Jᵀr is treated as zero below this fraction of ‖J_j‖ ‖r‖, because of rounding
-errors.
+"""Maximum estimated error of a minimum x of ‖r‖, relative to max(1, ‖x‖∞).
+
+The limit is larger than for a root, because rounding of ‖r‖² hides relative changes of √eps in x.
 """
+STATIONARY: Final = 1e-6
+"""Fraction of ‖J_j‖ ‖r‖ below which component j of the gradient Jᵀr counts as zero (rounding error)."""
 STALL_LIMIT: Final = 30
-"""Maximum number of steps in which ‖r‖² changes only by rounding errors; used if there are more equations
-than unknowns."""
+"""Maximum number of steps of a tall system (m > n) in which ‖r‖² changes by rounding errors only."""

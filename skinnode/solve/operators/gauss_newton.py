@@ -1,7 +1,7 @@
-"""Newton step −J⁺ r, which Gauss-Newton takes in full (Xu et al. 2018, eq. 8).
+"""Newton step −J⁺ r, which Gauss-Newton takes in full (Xu et al. 2018, eq. 8), and error estimates.
 
-After a step, −J⁺ r₊ with the residual r₊ at the new point and the factors of the previous J estimates the
-error of x (Deuflhard, Newton methods for nonlinear problems, 2004).
+After a step to a point with the residual r₊, the simplified correction −J⁺ r₊ with the previous J estimates
+the error of x (Deuflhard, Newton methods for nonlinear problems, 2004).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from skinnode.solve.operators.work import (
 
 @njit_part
 def factor(w: Work) -> bool:
-    """Factor J (by LU if J is square, else by QR), and compute the Newton step.
+    """Factor J, by LU if it is square and by QR otherwise, and compute the Newton step.
 
-    Sets ``newton`` and the entries FACTORED, SINGULAR, SIGN and ERROR of the workspace. Returns whether J has
-    full rank.
+    Writes ``newton``, the flags FACTORED, REDUCED, SINGULAR and (for a square J) SIGN, and the scalar ERROR.
+    Returns whether J has full rank.
     """
     n, flag = w.x.size, w.flag
     flag[FACTORED] = 1
@@ -64,7 +64,7 @@ def finite_jacobian(w: Work) -> bool:
 
 @njit_part
 def settled(w: Work, tol_f: float, tol_x: float) -> bool:
-    """Return whether x is a root or a minimum; set ANGLE if there are more equations than unknowns."""
+    """Return whether x is a root or a minimum; for a tall system, set ANGLE."""
     s = w.s
     small = largest(w.r) <= tol_f
     if w.r.size != w.x.size:
@@ -76,7 +76,7 @@ def settled(w: Work, tol_f: float, tol_x: float) -> bool:
 
 @njit_part
 def correction(w: Work, r: Float, out: Float) -> float:
-    """Write −J⁺ r, with the current factors, into ``out`` (n,); return its largest absolute value."""
+    """Write −J⁺ r, with the current factors of J, into ``out`` (n,); return its maximum norm."""
     n = out.size
     if w.r.size == n:
         for j in range(n):
@@ -94,7 +94,7 @@ def correction(w: Work, r: Float, out: Float) -> float:
 
 @njit_part
 def rounding(w: Work, x: Float) -> float:
-    """Write each residual's rounding error eps Σ_j |J_kj x_j| due to x into ``e``; return max |x|."""
+    """Write each residual's error due to rounding of x, eps Σ_j |J_kj x_j|, into ``e``; return max |x|."""
     top = 0.0
     for k in range(w.e.size):
         w.e[k] = 0.0
@@ -109,11 +109,10 @@ def rounding(w: Work, x: Float) -> float:
 
 @njit_part
 def estimate_error(w: Work, inverse: Float) -> float:
-    """Write J⁺ into ``inverse`` (n, m), using the last factors; return an error estimate of the solution.
+    """Write J⁺, with the last factors of J, into ``inverse`` (n, m); return an estimate of the error of x.
 
-    The error estimate is relative to max(1, ‖x‖∞). The error estimate is the sum of the last Newton
-    correction and the error due to rounding of x, which grows with the condition number of J. If J is
-    singular, the estimate is inf.
+    The estimate is relative to max(1, ‖x‖∞). It is the sum of the last Newton correction and the error due to
+    rounding of x, which grows with the condition number of J. If J is singular, it is inf.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -19,10 +19,11 @@ from skinnode.solve.operators.work import LAM, NEWTON_LENGTH, RADIUS, REDUCED, S
 
 @njit_part
 def marquardt_step(w: Work) -> None:  # noqa: C901 - Moré's iteration in one piece
-    """Set the step so that ‖D s‖ is within 10 % of the radius; find lam by Newton's method (Moré, § 5).
+    """Set a damped step s for which ‖D s‖ is within 10 % of the radius.
 
-    The bidiagonal form of J D⁻¹ is computed once per Jacobian. With s = D⁻¹ P t and ‖D s‖ = ‖t‖, each value
-    of lam then takes O(n) operations.
+    The damping parameter lam is found by Newton's method (Moré, section 5). The bidiagonal form of J D⁻¹ is
+    computed once per Jacobian. Since s = D⁻¹ P t and ‖D s‖ = ‖t‖, each value of lam then takes O(n)
+    operations.
     """
     (n, m), s, t = w.jt.shape, w.s, w.step
     radius = s[RADIUS]

@@ -1,20 +1,23 @@
-"""Iteration loop shared by all operators. The loop uses reverse communication: the caller evaluates r and J.
+"""Iteration loop of all operators, with reverse communication: the caller evaluates r and J.
 
-- ``begin`` starts from x, r and J in the workspace.
-- ``propose`` factors J and, unless x is a root, makes the Newton step the next ``trial``.
-- ``shorten`` replaces a trial outside the trust region with a trial inside it.
+- ``begin`` starts at x, with r and J in the workspace.
+- ``propose`` factors J and, unless x is a root or a minimum, makes the Newton step the next ``trial``.
+- ``shorten`` replaces a trial point outside the trust region with one inside it.
 - ``assess`` accepts or rejects the step, given r at ``trial`` in ``r_trial``, and updates the radius.
 
-The solver for the wires of a skin (compiled code) and ``solve_system`` (Python functions) thus use the same
-compiled steps. Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if
-it reduces r.
+The compiled solver for the wires of a skin and ``solve_system``, which calls Python functions, thus share the
+same compiled steps. Gauss-Newton accepts every step. Levenberg-Marquardt and dogleg accept only steps that
+reduce ‖r‖.
 
-For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
-‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding errors prevent r from falling below
-tol_f, any r within the rounding error of J·x is treated as zero. For a tall system, CONVERGED means a
-minimum: ‖P r‖ ≤ tol_f ‖r‖, where P projects onto the range of J, and the correction meets the same condition
-as for a root. The module ``minimum`` distinguishes minima from saddles. A stationary point of a square system
-with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
+For a square system, CONVERGED means a root, which meets two conditions: max|r| ≤ tol_f, and the simplified
+Newton correction with the current factors satisfies ‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞). If rounding errors keep
+r above tol_f, an r within the rounding error of J·x counts as zero.
+
+For a tall system, CONVERGED means a root or a minimum. At a minimum, ‖P r‖ ≤ tol_f ‖r‖, where P projects onto
+the range of J, and the correction meets the second condition above. The module ``minimum`` tells minima from
+saddles.
+
+A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
 """
 
 from __future__ import annotations
@@ -66,11 +69,11 @@ from skinnode.solve.operators.work import (
 
 @njit_part
 def begin(w: Work) -> int:
-    """Start from x, r and J in the workspace; return TRY, or INVALID_START if r is not finite or m < n."""
+    """Start at x, with r and J in the workspace; return TRY, or INVALID_START if r is not finite or m < n."""
     s, flag = w.s, w.flag
     for k in range(flag.size):
         flag[k] = 0
-    s[RADIUS] = -1.0  # a negative value makes the first call of propose set the radius
+    s[RADIUS] = -1.0  # negative, so that the first call of propose sets the radius
     s[LAM] = 0.0
     s[ERROR] = math.inf
     s[ANGLE] = 1.0
@@ -84,7 +87,7 @@ def begin(w: Work) -> int:
 
 @njit_part
 def set_trial(operator: int, w: Work) -> None:
-    """Set ``trial`` to x + step; for operators with a trust region, also set LENGTH and ``js``."""
+    """Set ``trial`` to x + step; for an operator with a trust region, also set LENGTH and ``js``."""
     for j in range(w.x.size):
         w.trial[j] = w.x[j] + w.step[j]
     if operator != GAUSS_NEWTON:
@@ -94,10 +97,10 @@ def set_trial(operator: int, w: Work) -> None:
 
 @njit_part
 def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
-    """Set the Newton step as the next trial point.
+    """Make the Newton step the next trial step.
 
-    Returns TRY with ``trial``, ``step`` and ``js`` set, OUTSIDE if the step is longer than the radius or
-    does not exist (call :func:`shorten`), or a Status.
+    Returns TRY after setting ``trial`` and ``step``; OUTSIDE if the Newton step does not exist or is longer
+    than the radius (then call :func:`shorten`); or a Status.
     """
     s, flag = w.s, w.flag
     if flag[FACTORED] == 0:
@@ -123,7 +126,7 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit_part
 def shorten(operator: int, w: Work) -> int:
-    """Set a step within the trust region; return TRY, or a Status at a stationary point."""
+    """Set a trial step within the trust region; return TRY, or a Status if x is a stationary point."""
     if slope_of(w) <= EPS:
         return CONVERGED if w.flag[SINGULAR] == 0 and w.r.size > w.x.size else ILL_CONDITIONED
     if operator == LEVENBERG_MARQUARDT:
@@ -136,7 +139,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Return whether ``r_trial``, with the norm ``norm``, is within the error due to rounding of x."""
+    """Return whether ``r_trial``, with the Euclidean norm ``norm``, consists of rounding errors only."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)
@@ -149,7 +152,7 @@ def _within_rounding(w: Work, norm: float) -> bool:
 
 @njit_part
 def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
-    """Accept or reject the trial point; return ACCEPTED (evaluate J at x next), REJECTED or a Status."""
+    """Accept or reject the trial point; return ACCEPTED (then evaluate J at x), REJECTED or a Status."""
     s = w.s
     norm = math.sqrt(dot(w.r_trial, w.r_trial))
     exhausted = _within_rounding(w, norm)
@@ -181,10 +184,10 @@ def start(w: Work) -> int:
 
 @njit
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
-    """Assess the last trial point; if it is not accepted, propose the next (called from Python).
+    """Assess the last trial point; propose the next if it was rejected. Called from Python.
 
-    ``went`` is the return value of the previous call, or ``REJECTED`` for the first call. Returns TRY
-    (evaluate r at ``trial`` into ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
+    ``went`` is the return value of the previous call; for the first call, REJECTED. Returns TRY (then write r
+    at ``trial`` to ``r_trial``), ACCEPTED (then write Jᵀ at ``x`` to ``jt``) or a Status.
     """
     if went == TRY:
         went = assess(operator, w, tol_f, tol_x)

@@ -1,10 +1,12 @@
-"""Second-order test of a stationary point of ‖r‖, and Newton's method for a minimum with r ≠ 0.
+"""Second-order test for minima of ‖r‖ with r ≠ 0, and Newton's method for such minima.
 
-The Hessian of ½ ‖r‖² is JᵀJ + S, where S = Σ_k r_k ∇²r_k is computed from central differences of Jᵀr at
-constant r. With D the column norms of J and J D⁻¹ = U Σ Vᵀ, the Hessian is D V (Σ² + C) Vᵀ D, C = Vᵀ D⁻¹ S
-D⁻¹ V, so JᵀJ is never formed. Row and column k of Σ² + C are divided by √(σ_k² + ν), with ν the rounding
-error of C. The smallest eigenvalue of the resulting matrix is 1 at a minimum with r = 0, and about 0 or
-negative at a flat point or saddle.
+The Hessian of ½ ‖r‖² is JᵀJ + S. S = Σ_k r_k ∇²r_k is computed from central differences of Jᵀr with constant
+r. With the column norms D of J, the decomposition J D⁻¹ = U Σ Vᵀ and C = Vᵀ D⁻¹ S D⁻¹ V, the Hessian is
+D V (Σ² + C) Vᵀ D. This form avoids the product JᵀJ.
+
+The test scales Σ² + C: row k and column k are divided by √(σ_k² + ν), where ν is the rounding error of C. The
+smallest eigenvalue of the scaled matrix is 1 at a minimum with r = 0, about 0 at a flat point, and negative
+at a saddle.
 """
 
 from __future__ import annotations
@@ -20,18 +22,21 @@ from skinnode.model.layout import Float
 from skinnode.solve.operators.codes import EPS, STATIONARY
 
 DIFFERENCE: Final = EPS ** (1 / 3)
-"""Step of a central difference, relative to the coordinate; balances truncation and rounding errors."""
+"""Relative step of a central difference; it balances truncation and rounding errors."""
 NOISE: Final = EPS ** (2 / 3)
 """Relative rounding error of a central difference with the step :data:`DIFFERENCE`."""
 CURVED: Final = 0.05
-"""Smallest scaled eigenvalue of the Hessian that is treated as positive. On the problems of Moré, Garbow &
-Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. On Watson's
-problem with n = 12, the eigenvalue at the minimum is only 0.003, because of rounding errors."""
+"""Limit above which the smallest scaled eigenvalue of the Hessian counts as positive.
+
+On the problems of Moré, Garbow & Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38
+at isolated minima. The exception is Watson's problem with n = 12: because of rounding errors, it is 0.003 at
+the minimum.
+"""
 CONTRACTION: Final = 0.5
-"""Maximum ratio of successive Newton steps during convergence."""
+"""Maximum ratio of successive Newton steps that still converge."""
 NEWTON_STEPS: Final = 8
-"""Maximum number of Newton steps to a minimum. Newton's method needs 4 steps from an error of 1 % if it
-converges quadratically."""
+"""Maximum number of Newton steps to a minimum. With quadratic convergence, 4 steps suffice from an error of
+1 %."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class Point:
 
     @property
     def cosine(self) -> float:
-        """Largest cosine of the angle between r and a column of J; 0 if both are zero."""
+        """Largest cosine of the angle between r and a column of J; 0 for a zero column or a zero residual."""
         with np.errstate(all="ignore"):
             below = column_norms(self.j) * self.norm
             share = np.divide(np.abs(self.j.T @ self.r), below, out=np.zeros(below.size), where=below > 0)
@@ -67,15 +72,15 @@ class Point:
 
 @dataclass(frozen=True)
 class Curvature:
-    """Curvature at a point: smallest eigenvalue of the Hessian, Newton step and error estimate."""
+    """Second-order properties of ½ ‖r‖² at a point."""
 
     lowest: float
-    """Smallest scaled eigenvalue; about 0 if ‖r‖ is constant in some direction, NaN if a number
-    overflowed."""
+    """Smallest scaled eigenvalue of the Hessian; about 0 if ‖r‖ is constant in some direction, NaN if a
+    number overflowed."""
     step: Float
-    """(n,) Newton step for Jᵀr = 0."""
+    """(n,) Newton step towards Jᵀr = 0."""
     error: float
-    """Largest shift of a coordinate of the minimum due to rounding of r, J and x."""
+    """Largest error of a coordinate of the minimum due to rounding of r, J and x."""
 
     @property
     def positive(self) -> bool:
@@ -89,11 +94,11 @@ def column_norms(j: Float) -> Float:
 
 
 def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
-    """Return the curvature at a point; evaluates 2n Jacobians to compute the Hessian."""
+    """Return the curvature at a point. Computing the Hessian requires 2n Jacobians."""
     n = at.x.size
     d = column_norms(at.j)
     d[d == 0.0] = 1.0
-    reach = at.norm / d  # change in each coordinate that changes r by ‖r‖
+    reach = at.norm / d  # change in each coordinate that, to first order, changes r by ‖r‖
     size = np.maximum(np.abs(at.x), np.minimum(reach, 1.0))
     s = np.empty((n, n))
     for k in range(n):
@@ -128,7 +133,7 @@ class Settled:
     lowest: float
     """Smallest scaled eigenvalue of the Hessian at the point; NaN if a number overflowed."""
     error: float
-    """Estimate of max |x − x*|; inf unless Jᵀr is zero and the Hessian positive definite."""
+    """Estimate of max |x − x*|; inf unless Jᵀr is zero and the Hessian is positive definite."""
 
 
 def settle(
@@ -138,7 +143,17 @@ def settle(
     tol_x: float,
     max_steps: int,
 ) -> Settled:
-    """Take Newton steps for Jᵀr = 0 until they stop contracting or ‖r‖ grows; assess the last point."""
+    """Take Newton steps towards Jᵀr = 0 until they converge or fail; assess the last point.
+
+    The steps fail if they no longer contract, if ‖r‖ grows, or if the Hessian is not positive definite.
+
+    Args:
+        residual: Function that returns r (m,) for x (n,).
+        jacobian: Function that returns J (m, n) for x (n,).
+        at: Starting point.
+        tol_x: Largest remaining step, relative to max(1, max|x|).
+        max_steps: Maximum number of Newton steps.
+    """
     before = math.inf
     for left in range(min(NEWTON_STEPS, max_steps), -1, -1):
         bent = curvature(jacobian, at)
@@ -151,6 +166,6 @@ def settle(
         if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
             break
         before, at = size, Point(x, r, jacobian(x))
-    # If Jᵀr is as small as rounding permits, the steps stop contracting because of rounding errors
+    # Near the limit set by rounding errors, the steps no longer contract, although Jᵀr is as good as zero.
     known = bent.positive and (reached or at.cosine <= STATIONARY)
     return Settled(at, bent.lowest, size + bent.error if known else math.inf)

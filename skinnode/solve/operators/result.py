@@ -1,4 +1,4 @@
-"""Result of ``solve_system``, which uses the same statuses as a skin's displacement field."""
+"""Result of ``solve_system``. The statuses are those of a displacement field."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ __all__ = ["PointKind", "Solution", "SolveStats", "Status"]
 
 
 class PointKind(enum.Enum):
-    """Type of the point at which ``solve_system`` stopped."""
+    """Kind of point at which ``solve_system`` stopped."""
 
     ROOT = "root"
-    """The residual r is zero within ``tol_f`` or within the error due to rounding of x."""
+    """r is zero, within ``tol_f`` or within the error due to rounding of x."""
     MINIMUM = "minimum"
     """‖r‖ has an isolated minimum above zero: Jᵀr is zero, and the Hessian of ½ ‖r‖² is positive definite."""
     FLAT = "flat"
-    """Jᵀr is zero, but r is not zero, and ‖r‖ is constant in some direction."""
+    """Jᵀr is zero, r is not, and ‖r‖ is constant in some direction."""
     SADDLE = "saddle"
-    """Jᵀr is zero, but r is not zero, and ‖r‖ decreases in some direction (a saddle point)."""
+    """Jᵀr is zero, r is not, and ‖r‖ decreases in some direction."""
     UNFINISHED = "unfinished"
-    """Neither r nor Jᵀr is zero at this point."""
+    """Neither r nor Jᵀr is zero, or the point was not classified."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,19 +34,21 @@ class Solution:
     x: Float
     """(n,) best iterate."""
     status: Status
-    """Status of the solve. The status is CONVERGED at a root and, if there are more equations than unknowns,
-    at a minimum. The status is ILL_CONDITIONED at a point that the equations do not determine, and at a
-    minimum of a square system with r ≠ 0."""
+    """Status of the solve.
+
+    CONVERGED means a root or, with more equations than unknowns, a minimum. ILL_CONDITIONED means a point
+    that the equations do not determine, or a minimum of a square system with r ≠ 0.
+    """
     kind: PointKind
-    """Type of the point: root, minimum or neither."""
+    """Kind of point that ``x`` is."""
     residual_norm: float
     """‖r‖₂ at ``x``."""
     optimality: float
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
-    """Estimate of max |x − x*|; inf unless CONVERGED.
+    """Estimate of max |x − x*|, where x* is the exact solution; inf unless CONVERGED.
 
-    The error estimate is the sum of the last Newton correction and the error due to rounding of x, which
-    grows with the condition number of J or, at a minimum, of the Hessian.
+    It is the sum of the last Newton correction and the error due to rounding, which grows with the condition
+    number of J or, at a minimum, of the Hessian.
     """
     stats: SolveStats

@@ -1,11 +1,15 @@
-"""Solver for any system F(x) = 0 with at least as many equations as unknowns.
+"""Solver for any system r(x) = 0 with at least as many equations as unknowns.
 
-Levenberg-Marquardt and dogleg make up to three attempts from the same start, with different trust regions.
-The first attempt uses Moré's column scaling with a radius of 100 ‖D x₀‖, as in MINPACK. The second uses D = I
-with a radius of ‖x₀‖, and the third uses D = I with a radius of 0.1 ‖x₀‖. Neither column scaling nor D = I is
-best for every system. Column scaling is suitable for unknowns with different units, but a column of J with a
-large norm near the start restricts all later steps. The attempts therefore take turns of 100, 200, 400, …
-steps each, until one attempt finds a root or minimum.
+Levenberg-Marquardt and dogleg make up to three attempts from the same starting point x₀, with different trust
+regions:
+
+1. Moré's column scaling with an initial radius of 100 ‖D x₀‖, as in MINPACK;
+2. D = I with an initial radius of ‖x₀‖;
+3. D = I with an initial radius of 0.1 ‖x₀‖.
+
+No choice of D is best for every system. Column scaling suits unknowns with different units, but a column of J
+with a large norm near x₀ restricts all later steps. The attempts therefore take turns of 100, 200, 400, …
+steps each, until one of them finds a root or a minimum.
 """
 
 from __future__ import annotations
@@ -28,18 +32,18 @@ from skinnode.solve.operators.minimum import Point
 from skinnode.solve.operators.result import PointKind, Solution
 
 TURN: Final = 100
-"""Number of steps in an attempt's first turn; doubled for each later turn.
+"""Number of steps in the first turn of each attempt; each later turn has twice as many.
 
-With column scaling, the operators converged from 90 of 138 starts on 46 problems of Moré, Garbow & Hillstrom.
-In 79 (dogleg) or 72 (Levenberg-Marquardt) of these 90 cases, 100 steps were enough.
+With column scaling, the operators converge from 90 of 138 starting points of 46 problems of Moré, Garbow &
+Hillstrom. In 79 (dogleg) or 72 (Levenberg-Marquardt) of these 90 cases, 100 steps are enough.
 """
 RADII: Final = (1.0, 0.1)
-"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. Each radius is used because it succeeds
-from some starting points from which the other radius fails."""
+"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. From some starting points, only one of
+the two radii leads to a solution."""
 
 
 def operator_code(name: str) -> int:
-    """Return the number of an operator in compiled code. Raises ValueError if the name is unknown."""
+    """Return the code of an operator. Raises ValueError if the name is unknown."""
     if not isinstance(name, str) or name not in op.OPERATORS:
         raise ValueError(f"operator: got {name!r}, must be one of {', '.join(op.OPERATORS)}")
     return op.OPERATORS[name]
@@ -70,20 +74,22 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
         jacobian: Function that returns ∂r/∂x (m, n) for x (n,).
         x0: (n,) starting point.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
-        tol_f: Maximum |r| at a root; at a minimum, maximum fraction of r in the range of J.
-        tol_x: Largest remaining correction, relative to max(1, max|x|).
+        tol_f: Maximum |r| at a root. At a minimum, maximum of ‖P r‖ / ‖r‖, where P projects onto the range of
+            J.
+        tol_x: Maximum size of the last Newton correction, relative to max(1, max|x|).
         max_steps: Maximum number of trial steps of all attempts together, including rejected steps.
 
     Returns:
-        The best iterate with its status and kind. CONVERGED means a root or, if there are more equations
-        than unknowns, an isolated minimum of ‖r‖; ``kind`` distinguishes the two. ILL_CONDITIONED means a
-        point that the equations do not determine, or a minimum of a square system with r ≠ 0, where J is
-        singular. INVALID_START means fewer equations than unknowns, or a residual or Jacobian that is not
-        finite at ``x0``. Testing a minimum requires at least 2 n Jacobians; ``stats`` includes them.
+        The best iterate, with its status and kind. CONVERGED means a root or, with more equations than
+        unknowns, an isolated minimum of ‖r‖; ``kind`` tells which. ILL_CONDITIONED means a point that the
+        equations do not determine, or a minimum of a square system with r ≠ 0, where J is singular.
+        INVALID_START means that there are fewer equations than unknowns, or that the residual or the Jacobian
+        is not finite at ``x0``. The test of a minimum evaluates at least 2 n Jacobians, which ``stats``
+        includes.
 
     Raises:
-        ValueError: If an argument is out of range, or an argument or returned array has the wrong shape. A
-            residual or Jacobian that is not finite never raises an exception.
+        ValueError: If an argument is out of range, or an argument or a returned array has the wrong shape. A
+            residual or Jacobian that is not finite does not raise an exception.
     """
     code = operator_code(operator)
     require_tolerances(tol_f, tol_x, max_steps)
@@ -110,7 +116,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
 def _solve(  # noqa: PLR0913 - the arguments of solve_system
     code: int, system: System, start: Point, tol_f: float, tol_x: float, max_steps: int
 ) -> Attempt:
-    """Run the attempts in turns; return the first to succeed, else the attempt with the smallest residual."""
+    """Run the attempts in turns; return the first that succeeds, or the one with the smallest residual."""
     attempts = [Attempt(code, system, start, 0.0)]
     later = [] if code == op.GAUSS_NEWTON else list(RADII)
     turn = TURN if later else max_steps
@@ -130,7 +136,7 @@ def _solve(  # noqa: PLR0913 - the arguments of solve_system
 
 
 def _best(attempts: list[Attempt], tol_x: float, steps: int) -> Attempt:
-    """Return the attempt with the smallest residual, after classifying its point."""
+    """Return the attempt with the smallest residual, with its point classified."""
     best = min(attempts, key=lambda each: each.norm)
     if best.kind is PointKind.UNFINISHED and best.went != op.INVALID_START:
         best.settle(tol_x, steps)

@@ -1,6 +1,6 @@
-"""Trust region ‖D s‖ ≤ radius: choice of the radius, and acceptance or rejection of a step.
+"""Trust region ‖D s‖ ≤ radius of a step s: choice of the radius, and acceptance or rejection of the step.
 
-A step is accepted only if it reduces r. Source: Moré, The Levenberg-Marquardt algorithm, 1978.
+A step is accepted only if it reduces ‖r‖ (Moré, The Levenberg-Marquardt algorithm, 1978).
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from skinnode.solve.operators.work import (
 SHRINK_BELOW: Final = 0.25
 ENLARGE_ABOVE: Final = 0.75
 REJECT_BELOW: Final = 1e-4
-"""Thresholds of the ratio of actual to predicted decrease in ‖r‖², for changing the radius and rejecting a
-step (Moré 1978)."""
+"""Thresholds for the ratio of the actual to the predicted decrease in ‖r‖² (Moré 1978): for shrinking the
+radius (SHRINK_BELOW), for enlarging it (ENLARGE_ABOVE), and for rejecting the step."""
 
 
 @njit_part
 def slope_of(w: Work) -> float:
-    """Write the gradient Jᵀr into the workspace; return its largest cosine |J_j·r| / (D_j ‖r‖)."""
+    """Write the gradient Jᵀr into the workspace; return the largest |J_j·r| / (D_j ‖r‖)."""
     top = 0.0
     for j in range(w.x.size):
         w.gradient[j] = dot(w.jt[j], w.r)
@@ -54,9 +54,9 @@ def slope_of(w: Work) -> float:
 
 @njit_part
 def measure_newton(w: Work) -> None:
-    """Update D and the length of the Newton step; set the initial radius.
+    """Update D and the length of the Newton step; in the first call, also set the initial radius.
 
-    A negative LIMIT selects D = I, with −LIMIT as the initial radius.
+    A negative LIMIT selects D = I and an initial radius of −LIMIT.
     """
     n, s = w.x.size, w.s
     if s[LIMIT] < 0.0:
@@ -80,7 +80,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error of the relative decrease in ‖r‖² for a step with little predicted change."""
+    """Return the rounding error of the relative decrease in ‖r‖²."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -90,7 +90,7 @@ def _gain_noise(w: Work) -> float:
 
 @njit_part
 def _stalled(w: Work) -> int:
-    """Return ACCEPTED or a Status for a step that changes ‖r‖ by less than its rounding error."""
+    """Return ACCEPTED or a Status for a step that changes ‖r‖ only by rounding errors."""
     square = w.r.size == w.x.size
     w.flag[STALLED] += 1
     if square or w.flag[STALLED] > STALL_LIMIT:
@@ -108,7 +108,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
         shrink = 0.1
         if gain >= 0.0:
             shrink = 0.5
-        elif norm < 10.0 * s[NORM]:  # minimise the parabola fitted to ‖r‖²
+        elif norm < 10.0 * s[NORM]:  # minimum of the parabola fitted to ‖r‖²
             shrink = 0.5 * slope / (slope + 0.5 * gain)
             shrink = 0.1 if shrink < 0.1 else (0.5 if shrink > 0.5 else shrink)
         reach = 10.0 * s[LENGTH]
@@ -123,7 +123,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the actual and the predicted decrease in ‖r‖², and update the radius.
+    """Compare the actual with the predicted decrease in ‖r‖², and update the radius.
 
     ``norm`` is ‖r‖ at the trial point. Returns ACCEPTED, REJECTED or a Status.
     """

@@ -1,9 +1,9 @@
-"""Workspace for the steps of a solve, and products with the workspace's Jacobian.
+"""Workspace of a solve, and products with its Jacobian.
 
-The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
-the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius. D is the running maximum of the column
-norms of J (Moré 1978), so that the solve does not depend on the units of the unknowns. In the second and
-third attempt of ``solve_system``, D is the identity.
+The symbols are those of the paper: the residual r (m,), its Jacobian J (m, n), which is stored transposed,
+and the Levenberg-Marquardt parameter lam. The trust region of a step s is ‖D s‖ ≤ radius. The diagonal of D
+is the running maximum of the column norms of J (Moré 1978), which makes the solve independent of the units of
+the unknowns. In the second and third attempt of ``solve_system``, D is the identity.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from skinnode.compiled.jit import njit_part
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index, padded
 
-# Scalars of a solve, in Work.s
+# Indices of the scalars of a solve in Work.s
 LIMIT, RADIUS, LAM, NORM, LENGTH, NEWTON_LENGTH, ERROR, ANGLE, SCALARS = range(9)
-# Flags of a solve, in Work.flag
+# Indices of the flags of a solve in Work.flag
 FACTORED, SINGULAR, SIGN, REDUCED, STALLED, FLAGS = range(6)
 
 
 class Work(NamedTuple):
-    """Arrays written while solving m equations in n unknowns."""
+    """Workspace for solving m equations in n unknowns."""
 
     x: Annotated[Float, "n"]
     trial: Annotated[Float, "n"]
@@ -32,18 +32,18 @@ class Work(NamedTuple):
     newton: Annotated[Float, "n"]
     gradient: Annotated[Float, "n"]
     scale: Annotated[Float, "n"]
-    """D."""
+    """Diagonal of D."""
     diagonal: Annotated[Float, "n"]
-    """Diagonal of R."""
+    """Diagonal of R of the QR factorisation of J."""
     beta: Annotated[Float, "n"]
-    """Factors β of the reflectors of Q."""
+    """Factors β of the reflectors of Q of the QR factorisation."""
     v: Annotated[Float, "n"]
     bd: Annotated[Float, "n"]
     """Diagonal of the bidiagonal form of J D⁻¹; its superdiagonal is ``bu``."""
     bu: Annotated[Float, "n"]
     across: Annotated[Float, "n"]
     down: Annotated[Float, "n"]
-    """Factors β of the bidiagonal form's left reflectors; for the right reflectors, see ``across``."""
+    """Factors β of the left reflectors of the bidiagonal form; ``across`` is for the right reflectors."""
     inverse: Annotated[Float, "n"]
     """Reciprocal diagonal of the damped bidiagonal form; its superdiagonal is ``ru``."""
     ru: Annotated[Float, "n"]
@@ -56,15 +56,15 @@ class Work(NamedTuple):
     jt: Annotated[Float, "n m"]
     """Jᵀ at x."""
     lu: Annotated[Float, "n+3 lanes_n"]
-    """LU factors of Jᵀ if the system is square; rows are padded to whole SIMD vectors."""
+    """LU factors of Jᵀ, for a square system; rows are padded to whole SIMD vectors."""
     qr: Annotated[Float, "m n"]
-    """QR factors of J if the system is tall."""
+    """QR factors of J, for a tall system."""
     right: Annotated[Float, "n+3 lanes_m"]
     """Right reflectors of the bidiagonal form."""
     left: Annotated[Float, "n lanes_n+3"]
     """Left reflectors of the bidiagonal form."""
     wide: Annotated[Float, "lanes_m"]
-    """Scratch array of the same length as a row of ``right``."""
+    """Scratch; as long as a row of ``right``."""
     pivot: Annotated[Index, "n"]
     s: Annotated[Float, "scalars"]
     flag: Annotated[Index, "flags"]

@@ -8,9 +8,10 @@
 
 :func:`load_hand` reads a file, and :func:`parse_hand` validates a table in memory. Both raise
 :class:`~skinnode.errors.ConfigError` with a one-line message: file, line and column, dotted key, value found
-and values allowed. Because TOML is typed, values are not converted: ``node_id = "3"`` is an error.
+and values allowed. Values must have the right TOML type, because they are not converted: ``node_id = "3"`` is
+an error.
 
-The suffix of a key is its unit; a key without a unit suffix contains a count, a ratio or a name.
+The suffix of a key gives the unit. A key without such a suffix contains a count, a ratio or a name.
 """
 
 from skinnode.config.buses import (

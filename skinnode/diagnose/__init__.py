@@ -6,8 +6,7 @@ contain functions that take a connection:
 * ``discovery`` finds the nodes.
 * ``node_info`` and ``pdo_parameters`` read the settings of a node.
 * ``object_dictionary`` reads and compares objects. ``data_sheet``, ``standard_objects`` and ``dcf`` supply
-their
-  names, types and expected values.
+  their names, types and expected values.
 * ``nmt_commands``, ``lss_commissioning`` and ``tare`` change the state or the settings of a node.
 
 ``skinnode doctor`` uses ``collect_facts`` and ``scan_capture`` to collect facts about a bus,

@@ -34,8 +34,8 @@ LISTEN_S: Final = 1.2
 """Minimum listening time, s. A stopped node answers no SDO request and is found only by its heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum duration of the search for nodes without a node-ID, s. The search then
-ends, even if further nodes remain unidentified."""
+"""Maximum duration of the search for nodes without a node-ID, s. The search then ends, even if further nodes
+remain unidentified."""
 
 OTHERS_S: Final = 1.0
 """Maximum wait for the SDO transfers of other clients to end, s."""

@@ -183,7 +183,7 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
     """Return the total wrench of contacts that are expressed in the same frame.
 
     Errors of contacts on different patches are assumed to be independent. Errors of contacts on the same
-    patch are correlated: noise shifts load between neighbouring contacts, and an error in the assumed
+    patch may be correlated: noise can shift load between neighbouring contacts, and an error in the assumed
     stiffness scales all forces. Since the correlation is unknown, their covariances are combined into an
     upper bound that holds for any correlation.
 

@@ -36,12 +36,12 @@ _RETRY_S: Final = 0.05
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Highest SYNC counter of the second master."""
+"""Maximum of the SYNC counter sent by the second master."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus. The default is no faults.
+    """Faults of one bus; none by default.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
@@ -52,15 +52,15 @@ class BusFaults:
     bus_off: bool = False
     """Whether the nodes' CAN controller is bus-off: the nodes neither send nor receive frames."""
     starved: float = 0.0
-    """Bus load caused by a rogue device, as a fraction. Its frames have COB-ID 0x001, the highest priority
-    after NMT."""
+    """Fraction of the bus capacity taken up by a rogue device, whose frames have COB-ID 0x001, the highest
+    priority after NMT."""
     rogue_nmt_per_s: float = 0.0
     """Rate of random NMT commands from a second master, each to one node or to all nodes, 1/s."""
     rogue_sync_per_s: float = 0.0
     """Rate of SYNC messages from a second master, 1/s."""
     disturbed: float = 0.0
-    """Fraction of transmissions that an error frame aborts, so that the sender repeats them. Only the
-    interface ``timed`` supports this fault."""
+    """Fraction of transmissions aborted by an error frame. The sender repeats them. Only the interface
+    ``timed`` supports this fault."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:

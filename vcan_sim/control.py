@@ -1,7 +1,7 @@
 """Control of a running simulator from another process, through JSON messages on a Unix socket.
 
 Each simulator listens on its own socket, ``PID.sock``, in a folder that only the user can access. A request
-is one line, and so is its response::
+and its response are one line each::
 
     {"faults": ["palm:unplugged"]}
     {"hand": "gripper", "now": ["palm:unplugged"], "counts": {"palm": {"unplugged": 1}, "can0": {}}}
@@ -31,7 +31,7 @@ _ANSWER_S: Final = 10.0
 _POLL_S: Final = 0.2
 """Interval at which the server thread checks whether to stop, s."""
 KEY: Final = "inject"
-"""Key that error messages name for the requested faults."""
+"""Key under which error messages report invalid requests."""
 
 
 class ControlError(SkinError):
@@ -60,7 +60,7 @@ class Answer:
     """Counts of the faults injected so far, by patch and bus."""
 
     def lines(self) -> list[str]:
-        """Return one line per patch and bus, with its current faults and its counts of injected faults."""
+        """Return one line of text per patch and bus: current faults, and counts of injected faults."""
         now = dict(text.rpartition(":")[::2] for text in self.now)
         return [
             f"{place}: {now.get(place, 'none')} now; {_listed(counts)} so far"
@@ -73,7 +73,7 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def control_folder() -> Path:
-    """Return the folder of the control sockets, after creating it with access for this user only.
+    """Return the folder of the control sockets, creating it for this user alone if necessary.
 
     Raises:
         ControlError: If the folder cannot be created, or other users can access it.

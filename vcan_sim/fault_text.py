@@ -42,10 +42,10 @@ class FaultChange:
     values: Mapping[str, Value] = field(default_factory=dict)
     """New values of the faults, by name."""
     clears: bool = False
-    """Whether all current faults of the patch or bus end first."""
+    """Whether all current faults end before the new values are set."""
 
     def of(self, faults: AnyFaults) -> AnyFaults:
-        """Return ``faults`` after this change.
+        """Return ``faults`` with this change applied.
 
         Raises:
             ConfigError: If a value is out of range, or two values are inconsistent.
@@ -109,7 +109,7 @@ def text_of(faults: Faults | BusFaults) -> str:
 
 
 def name_and_value(name: str, value: Value) -> str:
-    """Return one fault in text form, as its name if the value is True, otherwise as ``NAME=VALUE``."""
+    """Return one fault in text form: its name if the value is True, otherwise ``NAME=VALUE``."""
     return name if value is True else f"{name}={_shown(value)}"
 
 
@@ -177,5 +177,5 @@ def _allowed(kind: type) -> str:
 
 
 def none_of(*, on_bus: bool) -> Faults | BusFaults:
-    """Return an empty set of faults, for a bus or for a patch."""
+    """Return the faults of a fault-free bus or patch."""
     return NO_BUS_FAULTS if on_bus else NO_FAULTS

@@ -60,14 +60,14 @@ _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults of one simulated node. The default is no faults.
+    """Faults of one simulated node; none by default.
 
     Raises:
         ConfigError: If a value is out of range, or the fractions of chunks or of scans add up to more than 1.
     """
 
     seed: int = 1
-    """Random seed. With the same seed, the same frames suffer the same faults."""
+    """Random seed. Equal seeds and equal sequences of frames lead to equal faults."""
 
     # --- fractions of the chunks
     lost: float = 0.0
@@ -99,9 +99,9 @@ class Faults:
     """Fraction of scans in which one chunk carries the scan counter of the next scan. The next scan then
     lacks the chunk with the same index."""
     understated: float = 0.0
-    """Fraction of scans in which one chunk is lost and the summary hides the loss. The summary states one
+    """Fraction of scans in which one chunk is lost and the summary hides the loss. The summary counts one
     chunk fewer, sets the flag for changed chunks only, and has a valid check if the node sends checks. If the
-    node itself sent only changed chunks, the summary is left unaltered."""
+    node itself sent only changed chunks, the summary is not altered."""
     unchecked: float = 0.0
     """Fraction of scans whose summary contains no check, as in protocol revision 1.0."""
     struck: int | None = None
@@ -174,8 +174,8 @@ class Faults:
     crossed_lower: int | None = None
     """Number of a lower wire whose connection is swapped with that of the next lower wire."""
     flipped: float = 0.0
-    """Fraction of readings with one flipped bit in one code. The check of the scan includes the flipped bit,
-    so it passes."""
+    """Fraction of readings with one flipped bit in one code. The check is computed with the flipped bit, so
+    the scan passes it."""
     drift_per_s: float = 0.0
     """Relative drift of all resistances per second, from -1 to 1. The accumulated factor stays between 0.1
     and 10, and the drift disappears when the fault ends."""

@@ -1,4 +1,4 @@
-"""Bus of simulated nodes with injected faults, and their port on this bus."""
+"""Bus with injected faults, and the port of the simulated nodes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Passed:
 
 
 class FaultyPort(CanPort):
-    """Port that can be bus-off, when it neither sends nor delivers frames."""
+    """Port with a switchable bus-off state, in which it neither sends nor delivers frames."""
 
     off = False
 
@@ -125,7 +125,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """Let error frames abort the fraction ``share`` of all transmissions from now on."""
+        """From now on, abort the fraction ``share`` of all transmissions with error frames."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

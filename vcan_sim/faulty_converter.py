@@ -15,7 +15,7 @@ from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
 MOST_DRIFT: Final = 10.0
-"""Largest factor by which drift multiplies or divides a resistance."""
+"""Limit of the factor by which drift multiplies or divides a resistance."""
 WIRE_NOISE: Final = 3e-3
 """Noise of a resistance measured through a bad contact: relative standard deviation."""
 
@@ -69,7 +69,7 @@ class FaultyConverter:
         return self._reading
 
     def _shifted(self, read: Float, t_ns: int) -> Float:
-        """Return a reading with drift and temperature change applied."""
+        """Apply drift and temperature change to a reading."""
         faults, injected = self._injector.faults, self._injector.injected
         factor = 1.0
         if faults.drift_per_s:
@@ -110,7 +110,7 @@ class FaultyConverter:
         return read
 
     def _hold(self, read: Float, faults: Faults) -> None:
-        """Reset frozen wires and stuck crossings to their resistances at the start of the fault."""
+        """Replace the resistances of frozen wires and stuck crossings with those from the fault start."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
         held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (
@@ -125,7 +125,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """Return a reading in which, with probability ``flipped``, one bit of one code is flipped."""
+        """Flip one bit of one code of a reading, with probability ``flipped``."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

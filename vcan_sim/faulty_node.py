@@ -1,7 +1,7 @@
 """Simulated node with injected faults. All frames to and from the node pass through this module.
 
 :mod:`vcan_sim.faulty_converter` implements the faults of readings, and :mod:`vcan_sim.faulty_scans` those of
-scans. Apart from periodic events, a seed and the sequence of frames determine all faults.
+scans. All faults other than periodic events are determined by a seed and the sequence of frames.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class FaultyNode(PatchNode):
             counter_overflow=lambda: self._store.integer(od.SYNC_COUNTER_OVERFLOW),
         )
         self._unplugged = self._stormed = self._passive = False
-        self._controller = BusState.ACTIVE  # without faults
+        self._controller = BusState.ACTIVE  # actual state, disregarding faults
         self._twin: PatchNode | None = None
         self._layout, self._serial = layout, serial
         self._due_ns = dict.fromkeys(("restart", "emcy", "babble"), 0)
@@ -140,12 +140,12 @@ class FaultyNode(PatchNode):
 
     @property
     def injected(self) -> Injected:
-        """Counts of injected faults; they change while the node runs."""
+        """Counts of injected faults, updated as the node runs."""
         return self._injector.injected
 
     @property
     def tally(self) -> Tally:
-        """Frame counts of the node, by kind; they change while the node runs."""
+        """Frame counts of the node by kind, updated as the node runs."""
         return self._injector.tally
 
     # --- input to the node: frames and time
@@ -210,7 +210,7 @@ class FaultyNode(PatchNode):
         return min((each for each in (own, of_twin) if each is not None), default=None)
 
     def _own_deadline_ns(self, faults: Faults) -> int | None:
-        """Return the time (ns) of the next timer or periodic event, without the second node; None if none."""
+        """Return the time (ns) of this node's next timer or periodic event; None if nothing is due."""
         if faults.error_passive != self._passive:
             return 0
         own = super().next_deadline_ns()
@@ -324,7 +324,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the data of an outgoing frame, with a false identity or layout hash if so required."""
+        """Return the data of an outgoing frame, with the identity or layout hash falsified if necessary."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id

@@ -26,7 +26,7 @@ class Put(Protocol):
 
 
 class FaultyScans:
-    """Sender of a node's chunks and summaries, which injects faults on the way.
+    """Injector of faults into the chunks and summaries that a node sends.
 
     A scan suffers either one scan fault, or chunk faults in any number of its chunks. A chunk suffers at most
     one fault.
@@ -79,7 +79,7 @@ class FaultyScans:
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk, after applying the scan fault or a chunk fault."""
+        """Apply the scan fault or a chunk fault to a chunk, and send it."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
@@ -102,7 +102,7 @@ class FaultyScans:
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Send a summary, after applying the scan fault."""
+        """Apply the scan fault to a summary, and send it."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])

@@ -29,7 +29,7 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Length of the scene computed before the nodes start, s. The contact mechanics of the rest is computed on
+"""Length of the scene whose contact mechanics are computed before the nodes start, s. The rest is computed on
 demand."""
 
 
@@ -239,7 +239,7 @@ class Fleet:
         }
 
     def tally(self, patch: str) -> Tally:
-        """Return the frame counts of a patch's node, by kind. The counts change while the node runs."""
+        """Return the frame counts of a patch's node, by kind. Updated as the node runs."""
         return self._stations[patch].tally()
 
     def passed(self, bus: str) -> Passed:

@@ -9,14 +9,14 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Random occurrence of the faults of one node, and their counts.
+    """Random generator and counter of the faults of one node.
 
     The random sequence is reproducible: it depends only on the seed, the node-ID and the order of calls. Any
     thread may assign :attr:`faults` at any time.
 
     Args:
         faults: Initial faults. Their seed remains in use when the faults are replaced.
-        node_id: Node-ID, which makes the random sequences of nodes with the same seed differ.
+        node_id: Node-ID. Nodes with the same seed have different random sequences.
     """
 
     def __init__(self, faults: Faults, node_id: int) -> None:
@@ -29,7 +29,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Draw at most one of several faults, and return its name or ""."""
+        """Return the name of at most one of several faults, drawn at random, or ""."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""
@@ -41,7 +41,7 @@ class Injector:
         return ""
 
     def loses(self, fault: str | None) -> bool:
-        """Draw whether a fault drops a frame. If it does, count the fault."""
+        """Return whether a fault drops a frame, decided at random. If so, count the fault."""
         if fault is None or not self.draw(getattr(self.faults, fault)):
             return False
         self.count(fault)

@@ -43,7 +43,7 @@ BUSES: Final = {
 """python-can interface and channel of each choice of ``--skin-bus``. Braces are replaced by the number of the
 bus in the hand. An empty channel stands for a random channel per test."""
 TRUTH_READINGS: Final = 200
-"""Number of latest readings per patch whose ground truth is saved when a test fails."""
+"""Number of most recent readings per patch whose ground truth is saved when a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

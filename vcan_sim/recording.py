@@ -37,7 +37,7 @@ SCENE: Final = "scene.json"
 
 
 def channel_of(bus: str) -> str:
-    """Return the channel name of a bus in a trace: its name, with underscores for spaces."""
+    """Return the channel name that represents a bus in a trace. Spaces become underscores."""
     return re.sub(r"\s", "_", bus)
 
 
@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Record the ground truth of the scans, and the fault changes, since the last call."""
+        """Record the ground truth of all scans, and all fault changes, since the last call."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

@@ -24,7 +24,7 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Minimum time before the first press, s, for measuring the baseline of the untouched skin."""
+"""Minimum time before the first press, s. The baseline is measured on the untouched skin in this time."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Durations of press, slide and lift, as fractions of a cycle. The skin is untouched for the rest."""
@@ -72,8 +72,8 @@ class Scene:
         layout: Layout of the patch at rest, with the upper electrodes on the surface of the rubber. Curved
             skin is projected onto the x-y plane.
         simulation: Seed, sphere radius, depth, friction, speed and timing of the strokes.
-        number: Number of the patch in the hand, on which the random strokes and the time of the first touch
-            depend.
+        number: Number of the patch in the hand. It selects the random strokes and the time of the first
+            touch.
         rubber: Material of the skin. Its Young's modulus affects forces but not displacements.
     """
 
@@ -84,7 +84,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time of the first touch, s. It varies by up to a quarter of a cycle between patches."""
+        """Scene time of the first touch, s. Patches differ by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:

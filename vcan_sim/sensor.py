@@ -20,8 +20,8 @@ REMEMBERED_READINGS: Final = 4096
 """Number of recent readings whose times are stored: five minutes at 12.5 scans per second."""
 
 Fault = Callable[[Float, int], Float]
-"""Function from a reading (U, K), ohm, and its time, ns, to the faulty reading. An open pair of wires reads
-inf, and a shorted pair reads 0."""
+"""Function that takes a reading (U, K) in ohm and its time in ns, and returns the faulty reading. An open
+pair of wires reads inf, and a shorted pair reads 0."""
 
 
 class SkinMotion(Protocol):
@@ -101,7 +101,7 @@ class SimulatedPatch:
         self._origin_ns = t_ns
 
     def read(self, t_ns: int) -> Float:
-        """Return a noisy reading of the resistances (U, K) at ``t_ns``, ohm.
+        """Return a noisy reading of the resistances (U, K) at ``t_ns`` in ohm.
 
         The seed and the number of the reading determine the noise; the time does not matter.
         """
@@ -114,7 +114,7 @@ class SimulatedPatch:
         return read if self.fault is None else self.fault(read, t_ns)
 
     def exact_ohm(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) at ``t_ns`` without converter noise, ohm."""
+        """Return the noise-free resistances (U, K) at ``t_ns`` in ohm."""
         t_s = self.scene_s(t_ns)
         return self.skin.rest_ohm if t_s is None else self.skin.analogue_ohm(t_s, self.scene.upper_m)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 GLIDE_RAMP: Final = 0.2
-"""Duration of each ramp of :func:`glide`, acceleration and deceleration, as a fraction of the total."""
+"""Duration of each of the two ramps of :func:`glide`, as a fraction of the total duration."""
 
 
 def ease(share: float) -> float:

@@ -1,4 +1,4 @@
-"""Counts of frames by kind, for comparison of simulated nodes with the host that receives them."""
+"""Frame counts by kind, for checking the counts of a host against those of the simulated nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting in tests, in virtual or real time."""
+"""Wait functions for tests, in virtual or real time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def eventually(
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Check that a ``with`` block ends in time. The check comes at the end and does not interrupt the block.
+    """Check a time limit at the end of a ``with`` block. The block is not interrupted.
 
     Args:
         seconds: Maximum duration, s.

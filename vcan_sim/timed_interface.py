@@ -145,7 +145,7 @@ class Segment:
     def catch_up(self) -> None:
         """Simulate the bus up to the current virtual time.
 
-        Otherwise, the simulation catches up only when a frame must wake a reader, at most
+        Without this call, the simulation catches up when a frame must wake a reader, at most
         :data:`COALESCED_NS` later. Time stamps are exact either way.
         """
         self._deliver()
@@ -303,7 +303,7 @@ class TimedInterface(can.BusABC):
             channel=self._segment.channel,
         )
 
-    # --- methods that CanPort prefers to send and recv
+    # --- methods that CanPort uses instead of send and recv
 
     def send_frame(self, can_id: int, data: bytes, *, remote: bool, fd: bool) -> None:
         """Queue a frame for transmission. See :class:`FrameInterface` for the arguments."""

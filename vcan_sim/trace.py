@@ -21,7 +21,7 @@ _LAST_FRAMES: Final = 10_000
 
 
 class Trace:
-    """Recorder of the frames on a timed bus from now on. The time stamp of a frame is its end.
+    """Recorder of all further frames on a timed bus, each stamped with the time of its end.
 
     Args:
         of: Bus to record.

@@ -34,7 +34,7 @@ START_NS: Final = 1_000_000_000_000
 START_WALL_NS: Final = 1_600_000_000_000_000_000
 """Start time (ns since 1970) of a virtual clock: 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
-"""Number of clock readings between two waits after which a thread counts as polling."""
+"""Number of clock readings without a wait after which a thread counts as polling."""
 POLL_S: Final = 1e-4
 """Time for which each further clock reading suspends a polling thread, s."""
 
@@ -142,7 +142,7 @@ class VirtualClock:
     # --- synchronisation objects
 
     def event(self) -> threading.Event:
-        """Return a cleared event for threads in virtual time."""
+        """Return an unset event in virtual time."""
         return _Event(self)
 
     def queue(self) -> queues.Queue[Any]:
@@ -154,11 +154,11 @@ class VirtualClock:
         return cast("queues.SimpleQueue[Any]", _Queue(self))
 
     def lock(self) -> _Lock:
-        """Return an unlocked lock for threads in virtual time."""
+        """Return an unlocked lock in virtual time."""
         return _Lock(self)
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
-        """Return a new daemon thread for virtual time, not yet started."""
+        """Return an unstarted daemon thread that runs in virtual time."""
         return _Thread(self, target, name, args)
 
     def pool(self, threads: int, name: str) -> Executor:

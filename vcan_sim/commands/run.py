@@ -158,7 +158,7 @@ def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[Node
 
 
 def _too_slow(before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
-    """Return a warning if this machine was too busy for all scans; otherwise, return ""."""
+    """Return a warning if this machine was too busy and scans were skipped; otherwise, return ""."""
     steps = list(zip(before, now, strict=True))
     skipped = sum(new.slow_overruns - old.slow_overruns for old, new in steps)
     if not skipped:

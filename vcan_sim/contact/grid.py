@@ -34,7 +34,7 @@ class Grid:
 
     @classmethod
     def of(cls, layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
-        """Return a grid, after computing its elastic response.
+        """Create a grid, and compute its elastic response.
 
         Args:
             layer: Elastic layer under the cells.
@@ -49,23 +49,23 @@ class Grid:
         return cls(layer, shape, size_m, padded, fft.rfft2(turned))
 
     def centres_m(self, origin_m: Float) -> Float:
-        """Return the cell centres (X, Y, 2), metres. The first is ``origin_m`` (2,)."""
+        """Return the cell centres (X, Y, 2) in metres, of which the first is ``origin_m`` (2,)."""
         x, y = (np.arange(n) * self.size_m for n in self.shape)
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + origin_m
 
     def displacement_m(self, traction_pa: Float) -> Float:
-        """Return the displacement (3, X, Y), metres, due to tractions (3, X, Y), Pa."""
+        """Return the displacement (3, X, Y) in metres due to tractions (3, X, Y) in Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     def normal_m(self, pressure_pa: Float) -> Float:
-        """Return the indentation (X, Y), metres, due to a pressure (X, Y), Pa."""
+        """Return the indentation (X, Y) in metres due to a pressure (X, Y) in Pa."""
         waves = self._response[2, 2] * fft.rfft2(pressure_pa, self._padded)
         return np.asarray(fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
 
     def shear_m(self, traction_pa: Float) -> Float:
-        """Return the tangential displacement (2, X, Y), metres, due to shear tractions (2, X, Y), Pa."""
+        """Return the tangential displacement (2, X, Y) in metres due to shear tractions (2, X, Y) in Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
@@ -74,8 +74,8 @@ class Grid:
     def largest_compliance(self) -> float:
         """Upper bound on the eigenvalues of the shear compliance matrix, m/Pa.
 
-        Power iteration estimates the largest eigenvalue, and 10 % are added. The bound holds for every subset
-        of the cells too, because its compliance is a principal submatrix of a symmetric matrix.
+        The bound is an estimate by power iteration plus a margin of 10 %. It also holds for every subset of
+        the cells, whose compliance is a principal submatrix of a symmetric matrix.
         """
         vector = np.ones((2, *self.shape))
         largest = 0.0

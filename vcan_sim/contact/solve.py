@@ -50,7 +50,7 @@ class Contact:
     sticks: np.ndarray
 
     def force_n(self, grid: Grid) -> Float:
-        """Return the force (3,) that the body exerts on the skin, N."""
+        """Return the force (3,) in N that the body exerts on the skin."""
         return np.asarray(self.traction_pa.sum(axis=(1, 2)) * grid.size_m**2)
 
 
@@ -109,13 +109,13 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y), Pa: a multiple of the overlap, scaled by an exact line search."""
+    """Return a pressure (X, Y) in Pa: the overlap, scaled by an exact line search."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
 
 def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
-    """Return the frictional shear traction (2, X, Y) under a body, Pa.
+    """Return the shear traction (2, X, Y) in Pa that friction causes under a body.
 
     Args:
         grid: Cells on the surface.

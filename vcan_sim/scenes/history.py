@@ -1,7 +1,7 @@
 """Contact mechanics of one touch at fixed time steps.
 
 Friction depends on history, so the time steps are computed in order and stored. The cells belong to a lattice
-that is fixed to the patch. The window of cells follows the body in whole cells, so tractions are never
+that is fixed to the patch. The window follows the body in steps of whole cells, so tractions are never
 interpolated.
 """
 
@@ -101,7 +101,7 @@ class History:
             return self._steps[index]
 
     def cell_m(self, first: tuple[int, int]) -> Float:
-        """Return the centre (2,) of a lattice cell in the patch frame, metres."""
+        """Return the centre (2,) of a lattice cell in the patch frame, in metres."""
         return np.asarray(self.touch.at_m) + centred_m(self.window.grid) + self.size_m * np.array(first)
 
     def _following(self, number: int) -> Step | None:
@@ -151,7 +151,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Move the window to the body in whole cells. The tractions stay in place on the skin."""
+        """Move the window with the body, by whole cells. The tractions stay in place on the skin."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))

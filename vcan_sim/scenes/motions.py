@@ -78,7 +78,7 @@ def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
 
 
 def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y) since a motion began, metres."""
+    """Return the displacement (x, y) in metres since a motion began."""
     if motion.kind == "walk":
         return _walked_m(motion, t_s)
     way_x, way_y = motion.by_m or (0.0, 0.0)
@@ -88,7 +88,7 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
 
 
 def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y) of a random walk, metres.
+    """Return the displacement (x, y) of a random walk in metres.
 
     Between targets, the body follows a minimum-jerk profile.
     """
@@ -103,7 +103,7 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
-    """Return the targets (x, y) of a random walk relative to its start, metres.
+    """Return the targets (x, y) of a random walk in metres, relative to its start.
 
     They are distributed uniformly over a disc of radius ``reach_m``. The first target is the start itself.
     """

@@ -51,7 +51,7 @@ class PatchScene:
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the upper electrodes, metres.
+        """Return the positions (U, N, 3) of the upper electrodes in metres.
 
         At rest, the result is ``layout.upper_m`` itself.
 

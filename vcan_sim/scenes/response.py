@@ -15,13 +15,13 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Tabulated range of a point force's displacement, in layer thicknesses. Beyond it, the displacement is below
-``FAR``."""
+"""Maximum range of the table of displacement against distance, in layer thicknesses. Beyond it, the
+displacement is below ``FAR``."""
 CLUSTER_CELLS: Final = 6.0
 """Distance from the window, in cells, beyond which each block of 2 × 2 cells acts as one point force."""
 FAR: Final = 1e-5
-"""Displacement due to a point force that is neglected, relative to the maximum. In a bonded layer, the
-displacement decays exponentially with distance from the force."""
+"""Threshold below which the displacement due to a point force is neglected, relative to the maximum. In a
+bonded layer, the displacement decays exponentially with distance from the force."""
 POINTS: Final = 4096
 """Number of points in the table of displacement against distance from a point force."""
 
@@ -134,14 +134,14 @@ def _forces(force_n: Float, origin_m: Float, size_m: float) -> tuple[Float, Floa
 
 
 def _clustered(force_n: Float) -> Float:
-    """Return the forces (3, X/2, Y/2), N, on blocks of 2 × 2 cells, given the cell forces (3, X, Y)."""
+    """Return the forces (3, X/2, Y/2) in N on blocks of 2 × 2 cells, from those (3, X, Y) on cells."""
     x, y = force_n.shape[1:]
     even = np.pad(force_n, ((0, 0), (0, x % 2), (0, y % 2)))
     return np.asarray(even.reshape(3, (x + 1) // 2, 2, (y + 1) // 2, 2).sum(axis=(2, 4)))
 
 
 def _cubic(field: Float, index: Float) -> Float:
-    """Return a field (3, X, Y) interpolated at fractional indices (P, 2) by bicubic polynomials, (P, 3)."""
+    """Interpolate a field (3, X, Y) at fractional indices (P, 2) by bicubic polynomials."""
     low = np.clip(np.floor(index).astype(np.intp) - 1, 0, np.array(field.shape[1:]) - 4)
     weights = _lagrange(index - low)
     found = np.zeros((len(index), 3))

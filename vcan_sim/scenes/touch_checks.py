@@ -18,7 +18,7 @@ from vcan_sim.scenes.tables import KEY_OF_TRAVEL, SceneConfig, TouchConfig
 from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
-"""Maximum depth of a body, as a fraction of the lesser of layer thickness and electrode height."""
+"""Maximum depth of a body, relative to the layer thickness or the electrode height, whichever is smaller."""
 APART: Final = 3.0
 """Minimum gap between simultaneous contacts on a patch, as a multiple of the layer thickness or of the larger
 contact's half width, whichever is smaller. Contacts are computed independently of each other. At this gap,

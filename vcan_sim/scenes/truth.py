@@ -23,8 +23,8 @@ class BodyContact:
             skin.
         origin_m: (2,) centre of the first cell, metres.
         cell_m: Side length of a cell, metres.
-        traction_pa: (3, X, Y) tractions on the skin (force per area) in the patch frame, Pa. X and Y number
-            the cells along x and y.
+        traction_pa: (3, X, Y) tractions on the skin (force per area) in the patch frame, Pa. The last two
+            axes run along x and y.
     """
 
     body: str

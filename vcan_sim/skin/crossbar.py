@@ -46,12 +46,12 @@ class Side:
 
     @property
     def feed_ohm(self) -> Float:
-        """Resistance (W,) between the source or amplifier and the first node of each wire, ohm."""
+        """Resistance (W,) in ohm between the source or amplifier and the first node of each wire."""
         return np.asarray(self.series_ohm + self.wire_ohm)
 
     @property
     def ideal(self) -> bool:
-        """Whether no wire has any resistance to its source or amplifier."""
+        """Whether all wires connect to their sources or amplifiers without resistance."""
         return not self.feed_ohm.any()
 
     def first(self) -> Float:
@@ -82,7 +82,7 @@ class Side:
 
 
 def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) that the read-out ``grounded`` measures, ohm.
+    """Return the resistances (U, K) in ohm that the read-out ``grounded`` measures.
 
     Upper wires are driven one at a time, with all others grounded. A reading is the driving voltage divided
     by the current into the amplifier of a lower wire. Without series and wire resistances, it is the
@@ -108,7 +108,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) that the read-out ``floating`` measures, ohm.
+    """Return the resistances (U, K) in ohm that the read-out ``floating`` measures.
 
     One pair of wires is measured while all other wires float. A reading is the effective resistance between
     two nodes, Z_uu + Z_kk − 2 Z_uk, plus the series resistances of the two wires. Z is the inverse of the

@@ -46,7 +46,7 @@ class ExactForward:
         self._resistivity = resistivity_ohm_per_m
 
     def __call__(self, upper_m: Float) -> Float:
-        """Return the resistances (U, K), ohm, given the upper electrodes (U, N, 3), m."""
+        """Return the resistances (U, K) in ohm for upper electrodes (U, N, 3) in m."""
         distance = np.zeros((upper_m.size // 3, self._lower.shape[1]))
         for here, there in zip(upper_m.reshape(-1, 3).T, self._lower, strict=True):
             distance += (here[:, None] - there) ** 2
@@ -92,7 +92,7 @@ class Paths:
             return np.asarray(self._each(upper_m).reshape(shape).sum(axis=axes, keepdims=True))
 
     def _each(self, upper_m: Float) -> Float:
-        """Return the conductances (U N, K M) of all paths, 1/m. The next call overwrites the array."""
+        """Return the conductances (U N, K M) of all paths in 1/m. The next call overwrites the array."""
         plane, square = self._squares(upper_m)
         found: Float = self._work[2]
         with np.errstate(divide="ignore"):
@@ -108,7 +108,7 @@ class Paths:
         return found
 
     def _squares(self, upper_m: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in the x-y plane and in space, m², in reused arrays."""
+        """Return the squared distances (U N, K M) in the x-y plane and in space, in m², in reused arrays."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
         plane, square, gap = self._work
         for axis, out in ((0, plane), (1, gap), (2, square)):

@@ -42,13 +42,13 @@ class FrontEnd:
         self._amplifies = bool(imperfections.gain or imperfections.offset)
 
     def amplified_ohm(self, ohm: Float) -> Float:
-        """Return the amplifier output (U, K), with gain and offset errors, ohm."""
+        """Return the amplifier output (U, K) in ohm, with gain and offset errors."""
         if not self._amplifies:
             return ohm
         return np.asarray(ohm + self._gain * (ohm - self._rest_ohm) + self._offset_ohm)
 
     def converted_ohm(self, ohm: Float, reading: int) -> Float:
-        """Return the converter output (U, K), with noise and rounding, ohm.
+        """Return the converter output (U, K) in ohm, with noise and rounding.
 
         Args:
             ohm: (U, K) float64, ohm: converter input.

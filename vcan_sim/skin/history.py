@@ -1,4 +1,4 @@
-"""Hysteresis and creep of the rubber, by which the displacement depends on earlier loads.
+"""Hysteresis and creep of the rubber, which make the displacement depend on earlier loads.
 
 Hysteresis and then creep act on each coordinate of the displacement of each electrode:
 
@@ -76,7 +76,7 @@ class History:
         self._lock = threading.Lock()  # the node reads in one thread while another requests the truth
 
     def displacement_m(self, t_s: float, load: Load) -> Float | None:
-        """Return the displacement (U, N, 3) at ``t_s``, m; None before the first load.
+        """Return the displacement (U, N, 3) in m at ``t_s``; None before the first load.
 
         Args:
             t_s: Time since the start of the history, s.

@@ -82,9 +82,9 @@ class Imperfections:
     strain: float = 0.0
     """Relative change in resistivity per unit strain of a path between two electrodes."""
     warming_k: float = 0.0
-    """Final temperature rise, K, which is approached exponentially after the start of the scene."""
+    """Final temperature rise, K. It is approached exponentially from the start of the scene."""
     temperature_per_k: float = 2e-3
-    """Relative change in resistivity per kelvin. This value has no effect if ``warming_k`` is 0."""
+    """Relative change in resistivity per kelvin. It has no effect if ``warming_k`` is 0."""
     warming_s: float = 300.0
     """Time constant of the temperature rise, s."""
     creep: tuple[float, float] = (0.0, 0.0)

@@ -17,7 +17,7 @@ from vcan_sim.skin.history import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
-"""Maximum interval of a scan over which the motion of the electrodes is taken as linear, s."""
+"""Longest interval over which the motion of the electrodes during a scan is taken as linear, s."""
 
 Surface = Callable[[float], Float]
 """Function from time (s) to the positions (U, N, 3) of an exact patch's upper electrodes (m). At rest, it
@@ -68,7 +68,7 @@ class PhysicalPatch:
         at_rest_ohm = self._network_ohm(body.upper_m, cold)
         self._front_end = FrontEnd(imperfections, draws, at_rest_ohm)
         self.rest_ohm: Final = self._front_end.amplified_ohm(at_rest_ohm)
-        """(U, K) float64, ohm: converter input at rest, at time 0; read-only."""
+        """(U, K) float64, ohm: resistances at the converter input, at rest and at time 0; read-only."""
         for shared in (self.rest_m, self.lower_m, self.rest_ohm):
             shared.setflags(write=False)
 
@@ -97,7 +97,7 @@ class PhysicalPatch:
         return np.asarray((1.0 - share) * every[span, wires] + share * every[span + 1, wires])
 
     def analogue_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) at the input of the converter, ohm.
+        """Return the resistances (U, K) in ohm at the input of the converter.
 
         Args:
             t_s: Scene time of the scan, s.
@@ -109,7 +109,7 @@ class PhysicalPatch:
         return self._front_end.amplified_ohm(self._network_ohm(upper_m, self._warmth(t_s)))
 
     def converted_ohm(self, analogue_ohm: Float, reading: int) -> Float:
-        """Return the converter's output for a given input.
+        """Return the output of the converter for a given input.
 
         Args:
             analogue_ohm: (U, K) float64, ohm: input of the converter.
@@ -121,7 +121,7 @@ class PhysicalPatch:
         return self._front_end.converted_ohm(analogue_ohm, reading)
 
     def resistance_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the output (U, K) of the converter for one scan, ohm.
+        """Return the resistances (U, K) in ohm at the output of the converter, for one scan.
 
         The scene time, in whole nanoseconds, seeds the noise.
 
@@ -132,7 +132,7 @@ class PhysicalPatch:
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
 
     def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions (U, N, 3) of the upper electrodes, m; at rest, ``rest_m`` itself."""
+        """Return the true positions (U, N, 3) of the upper electrodes in m; at rest, ``rest_m`` itself."""
         layout_m = self.layout.upper_m
         if self._history is None:
             upper = upper_m_at(t_s)

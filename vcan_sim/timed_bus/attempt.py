@@ -1,6 +1,6 @@
 """Course of one transmission attempt: whether and when its frame is delivered or destroyed.
 
-:func:`undisturbed` handles the common case, for which the number of bits is enough. :func:`disturbed`
+:func:`undisturbed` handles the common case, which requires only the number of bits. :func:`disturbed`
 examines the individual bits of the frame.
 
 Error frames follow ISO 11898-1:2015 and Bosch CAN 2.0, part B, sections 3.1.3 and 7. The first station to
@@ -95,7 +95,7 @@ def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: Bit
 def disturbed(
     senders: Sequence[Participant], receivers: Sequence[Participant], hit: Hit | None, rates: BitRates
 ) -> Course:
-    """Return the course of a transmission attempt bit by bit, with all of its errors.
+    """Return the course of a transmission attempt, including any errors.
 
     Args:
         senders: stations that send frames with identical arbitration fields.

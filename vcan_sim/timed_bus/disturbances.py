@@ -1,7 +1,7 @@
 """Rules that inject bit errors.
 
-A disturbance inverts one bit of a frame, for all stations or for only one. Rules apply to every transmission
-attempt, so they can also destroy retransmissions.
+A disturbance inverts one bit of a frame, for all stations or for a single one. Rules apply to every
+transmission attempt, so they can also destroy retransmissions.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class NthFrame:
     attempts: int = 1
     """Number of disturbed attempts."""
     bit: int = 20
-    """Position of the disturbed bit, counting stuff bits; the start of frame is 0. The second-to-last bit of
-    the end of frame is the maximum, to which larger values are reduced."""
+    """Position of the disturbed bit, counting stuff bits; the start of frame is 0. Larger values are
+    clipped to the second-to-last bit of the end of frame."""
     extended: bool = False
     station: int | None = None
     """Station that sees the disturbance; None for all stations."""

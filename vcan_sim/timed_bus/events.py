@@ -71,7 +71,7 @@ class BusOff(NamedTuple):
 
 
 class Recovered(NamedTuple):
-    """Event: a station recovered from bus-off, and both error counters are 0."""
+    """Event: a station recovered from bus-off. Both error counters are 0."""
 
     time_ns: int
     station: int

@@ -84,7 +84,7 @@ def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
         esi: whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
-        Number of bits at the nominal bit rate, and number at the data bit rate. The bit rate really changes
+        Number of bits at the nominal bit rate, and number at the data bit rate. The bit rate actually changes
         at the sample points of BRS and the CRC delimiter. Counting BRS as a nominal bit and the CRC delimiter
         as a data bit gives the same total duration.
     """

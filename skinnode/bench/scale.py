@@ -188,7 +188,7 @@ def scene_of(touched: int) -> SceneConfig:
 
 
 def _send_changed_only(hand: HandConfig) -> None:
-    """Configure all patches to send only changed chunks, and wait until they do."""
+    """Command all patches to send only changed chunks, and wait until they do so."""
     command = pack_command(send_mode=SendMode.CHANGED)
     for bus in hand.buses:
         with CanPort(bus) as port:

@@ -69,7 +69,7 @@ class Score:
 
     @property
     def within_uncertainty(self) -> bool:
-        """Whether all scans were trusted and all errors agree with the reported uncertainty."""
+        """Whether all scans were trusted and all errors are consistent with the reported uncertainty."""
         return (
             self.scans > 0
             and self.untrusted == 0

@@ -1,4 +1,4 @@
-"""Compares the numbers of frames sent and dropped in a soak test, by kind, with the host's counters."""
+"""Compares the host's counters with the numbers of frames sent and dropped in a soak test, by kind."""
 
 from __future__ import annotations
 

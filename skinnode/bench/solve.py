@@ -63,7 +63,7 @@ class Case:
         return self.jacobian_transposed(x).T
 
     def error(self, x: Float) -> float:
-        """Return the maximum coordinate error of x, relative to the largest displacement."""
+        """Return the largest error of a coordinate of x, relative to the largest displacement."""
         return float(np.abs(x - self.truth).max()) / self.size
 
 

@@ -30,7 +30,7 @@ CHUNK: Final = 3
 NOISY: Final = 3e-3
 """Relative noise of a wire with a bad contact; the simulator uses the same value."""
 SETTLE: Final = 50
-"""Number of scans at rest within which the host must detect a wrongly stated noise."""
+"""Number of scans at rest within which the host must detect that the hand file states a wrong noise."""
 
 InPlace = Callable[[Signal], None]
 

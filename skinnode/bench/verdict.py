@@ -18,9 +18,9 @@ row violates each condition with a probability of 1e-4.
   distribution. The probability per seed is bounded by the expected number of such errors in a seed. The test
   counts seeds, not coordinates, because only seeds are independent.
 
-If too many seeds have an error above 5 standard deviations, every wire with such an error is wrong. With
-exact data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6 of the
-wire's largest displacement, whichever is larger.
+If too many seeds have an error above 5 standard deviations, every wire with such an error is given the
+verdict ``wrong``. With exact data, no error is attributed to chance: the limit is 5 reported standard
+deviations or 1e-6 of the wire's largest displacement, whichever is larger.
 """
 
 from __future__ import annotations

@@ -40,9 +40,9 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    The contacts are those of the field. A field of the exact inverse may contain no contacts, for example in
-    an old recording. Each connected region of pressed skin then counts as a contact, whose force is known
-    only if a stiffness was specified.
+    The contacts are taken from the field. A field of the exact inverse may contain none, for example in an
+    old recording. Each connected region of pressed skin then counts as a contact, whose force is known only
+    if a stiffness was specified.
 
     Args:
         field: Newest field of the patch.

@@ -46,7 +46,7 @@ COMPLAINTS_KEPT: Final = 100
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
 """Maximum length of a line, bytes. An event with the baseline and the layout of the largest patch fits; a
-longer line is split."""
+longer line is read as several lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 

@@ -181,8 +181,8 @@ CODES: Final = 0x2100
 """Index of the latest codes of upper wire 0, one code per sub-index. The codes of upper wire r are at index
 CODES + r."""
 BASELINE: Final = 0x2200
-"""Index of the R0 of upper wire 0, ohm (0 if unknown), one crossing per sub-index. The R0 of upper wire r are
-at index BASELINE + r."""
+"""Index of the R0 values of upper wire 0, ohm (0 if unknown), one crossing per sub-index. The values of upper
+wire r are at index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see :mod:`skinnode.protocol.coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301

@@ -17,7 +17,7 @@ class Application(Protocol):
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         ...
 
     def power_on(self, t_ns: int) -> None:

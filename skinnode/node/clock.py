@@ -16,10 +16,10 @@ class Pacing:
     """Timer precision of a node's thread. Higher precision takes more processor time."""
 
     slack_ns: int
-    """Maximum time by which a timer may be delayed so that one wake-up serves several timers, ns. Received
+    """Maximum time (ns) by which a timer may be delayed so that one wake-up serves several timers. Received
     frames are never delayed."""
     catch_up_ns: int
-    """Maximum delay that is made up by sending the following chunks sooner, ns; 0 for a strict inhibit time.
+    """Maximum delay (ns) that is made up by sending the following chunks sooner; 0 for a strict inhibit time.
     See :mod:`skinnode.node.patch.scan_stream`."""
 
 

@@ -50,7 +50,7 @@ class EmcyProducer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the next queued message may be sent, ns."""
+        """Time (ns) at which the next queued message may be sent."""
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:

@@ -65,13 +65,13 @@ class ErrorControl:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
         return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
     @property
     def silent_from_ns(self) -> int:
-        """Time from which :meth:`on_timer` reports a missed heartbeat or guarding request, ns."""
+        """Time (ns) from which :meth:`on_timer` reports a missed heartbeat or guarding request."""
         return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:

@@ -26,7 +26,7 @@ class Guarding:
         self._toggle = 0
         self._guarded = False  # whether a guarding request has been received
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the node life time expires, ns."""
+        """Time (ns) at which the node life time expires."""
 
     def reset(self) -> None:
         """Reset the toggle bit and end guarding, as CiA 301 requires for *reset communication*."""

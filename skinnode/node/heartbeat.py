@@ -26,7 +26,7 @@ class HeartbeatProducer:
         self.period_ns = 0
         """Heartbeat period, ns; 0 if the node sends no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the next heartbeat must be sent, ns."""
+        """Time (ns) at which the next heartbeat must be sent."""
 
     def boot_up(self, period_ms: int, t_ns: int) -> None:
         """Start the schedule. The first heartbeat is due one period after the boot-up message.
@@ -63,7 +63,7 @@ class _Monitored:
     node_id: int
     within_ns: int
     deadline_ns: int = NO_DEADLINE_NS
-    """Time at which the next heartbeat is overdue, ns. Monitoring starts at the first heartbeat."""
+    """Time (ns) at which the next heartbeat is overdue. Monitoring starts at the first heartbeat."""
 
 
 class HeartbeatConsumer:
@@ -79,7 +79,7 @@ class HeartbeatConsumer:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
-        """Earliest time at which a heartbeat is overdue, ns."""
+        """Earliest time (ns) at which a heartbeat is overdue."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property

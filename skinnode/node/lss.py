@@ -115,8 +115,8 @@ class LssSlave:
         CiA 305 requires a slave to ignore frames that are not 8 bytes long, unknown commands, and requests
         that are not allowed in its current state, which may be intended for other slaves.
 
-        After *activate bit timing*, the node is silent for two delays. It changes its bit rate after the
-        first one. During the second one, all other nodes change their bit rates.
+        After *activate bit timing*, the node is silent for twice the delay in the request. It changes its bit
+        rate halfway. In the second half, the other nodes have time to change their bit rates.
 
         Args:
             data: payload of the frame.
@@ -229,7 +229,7 @@ class BitRateChange:
         self._bit_rate_bps: int | None = None
         self._change_ns = self._over_ns = NO_DEADLINE_NS
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which :meth:`silent` must be called next, ns."""
+        """Time (ns) at which :meth:`silent` must be called next."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
         """Start a bit rate change.

@@ -17,7 +17,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Maximum time to wait for a frame before the thread checks whether it has to stop, s."""
+"""Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
 
 _RETRY_S: Final = 0.02
 """Pause after a bus error, s; long enough for a full transmit queue to drain."""
@@ -27,11 +27,11 @@ _CATCH_UP_FRAMES: Final = 4096
 bus carries this number of frames in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Duration of continuous bus errors after which the nodes assume that their CAN controller is bus-off, s. A
+"""Duration (s) of continuous bus errors after which the nodes assume that their CAN controller is bus-off. A
 full transmit queue drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""Duration of continuous bus errors after which the CAN interface is reopened, s. This recovers an interface
+"""Duration (s) of continuous bus errors after which the CAN interface is reopened. This recovers an interface
 that was unplugged and plugged in again."""
 
 

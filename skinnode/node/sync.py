@@ -93,7 +93,7 @@ class Sync:
         self.cob_id = od.SYNC_COB_ID
         """COB-ID of the SYNC."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the next SYNC must be sent, ns."""
+        """Time (ns) at which the next SYNC must be sent."""
         store.guard(od.COB_ID_SYNC, self._guard_cob_id)
         store.guard(od.CYCLE_PERIOD, _guard_period)
         store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_overflow)

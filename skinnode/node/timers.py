@@ -17,7 +17,7 @@ class Timers:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the earliest timer is due, ns; NO_DEADLINE_NS if no timer is set."""
+        """Time (ns) at which the earliest timer is due; NO_DEADLINE_NS if no timer is set."""
         heap, due = self._heap, self._due
         while heap and due.get(heap[0][1]) != heap[0][0]:
             heapq.heappop(heap)

@@ -39,9 +39,9 @@ class Scan:
     flags: int
     """Summary flags (:class:`~skinnode.protocol.summary.SummaryFlag`); 0 if the summary was lost."""
     t_first_ns: int
-    """Arrival time of the first frame of the scan, ns."""
+    """Arrival time (ns) of the first frame of the scan."""
     t_last_ns: int
-    """Arrival time of the last frame of the scan, ns."""
+    """Arrival time (ns) of the last frame of the scan."""
 
     @property
     def phase(self) -> int:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames; 4 s of traffic at 1 Mbit/s and
-full load."""
+"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames. It holds 4 s of traffic from a
+fully loaded 1 Mbit/s bus."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
 """Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of it."""
@@ -56,7 +56,7 @@ _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Maximum time that the kernel needs to deliver a frame, s. The longest time observed was 28 ms."""
+"""Maximum time (s) that the kernel needs to deliver a frame. The longest time observed was 28 ms."""
 
 # Without a handler, programs that do not configure logging would print python-can's warnings to stderr.
 # BusError already reports the same errors.

@@ -20,33 +20,34 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Default capacity of a queue, frames; 2 s of traffic at 1 Mbit/s and full load (8,000 frames/s)."""
+"""Default capacity of a queue, frames. It holds 2 s of traffic from a fully loaded 1 Mbit/s bus (8,000
+frames/s)."""
 
 _POLL_S: Final = 0.02
-"""Maximum time to wait for a frame before the thread checks whether it has to stop, s."""
+"""Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause between batches of frames, ns. Without it, the receiving thread would wake up for every frame, up to
+"""Pause (ns) between batches of frames. Without it, the receiving thread would wake up for every frame, up to
 8,000 times per second. The pause does not affect the timestamps of the frames."""
 
 LONG_NS: Final = 5_000_000
-"""Pause between batches of frames while all arrival times are predicted, ns. An unexpected frame is delayed
+"""Pause (ns) between batches of frames while all arrival times are predicted. An unexpected frame is delayed
 by up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
 """Time before a predicted arrival at which the preceding frames are fetched, ns, so that the predicted frame
 itself is fetched without delay."""
 _SHORT_NS: Final = 300_000
-"""Minimum pause between batches of frames, ns; used around a predicted arrival."""
+"""Minimum pause (ns) between batches of frames; used around a predicted arrival."""
 _LATE_NS: Final = 600_000
-"""Time after a predicted arrival for which the minimum pause is used, ns."""
+"""Time (ns) after a predicted arrival for which the minimum pause is used."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time after its predicted arrival at which a frame is considered lost, ns."""
+"""Time (ns) after its predicted arrival at which a frame is considered lost."""
 _ANSWER_NS: Final = 20_000_000
-"""Time after a request within which the response is expected, ns."""
+"""Time (ns) after a request within which the response is expected."""
 _LAG_NS: Final = 50_000
-"""Time from the arrival of a frame until it can be read from the socket, ns."""
+"""Time (ns) from the arrival of a frame until it can be read from the socket."""
 
 
 class Intake:
@@ -70,9 +71,9 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time until which all received frames have been queued or dropped, ns."""
+        """Monotonic time (ns) until which all received frames have been queued or dropped."""
         self.due_ns = 0
-        """Monotonic time of the next :meth:`fetch`, ns."""
+        """Monotonic time (ns) of the next :meth:`fetch`."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
         # _taken is written by the reader thread, _put and _dropped by the receiving thread.
@@ -330,15 +331,16 @@ def _fetch(intakes: Iterable[Intake]) -> bool:
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
-    """Return the end of a pause of 0.5 to 1.5 times ``pause_ns``, ns.
+    """Return the time (ns) at which a pause of about ``pause_ns`` ends.
 
-    All pauses end at multiples of ``pause_ns``, so that all buses are read at the same time.
+    Pauses end at multiples of ``pause_ns``, so that all buses are read at the same time. A pause therefore
+    lasts 0.5 to 1.5 times ``pause_ns``.
     """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
 
 def _before(t_ns: int, now_ns: int) -> int:
-    """Return the time of the next fetch if a frame is predicted to arrive at ``t_ns``, ns."""
+    """Return the time (ns) of the next fetch, given that a frame is predicted to arrive at ``t_ns``."""
     due_ns = t_ns + _LAG_NS
     if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
         due_ns -= _BEFORE_NS

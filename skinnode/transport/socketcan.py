@@ -46,13 +46,13 @@ _OLDEST_NS: Final = 10_000_000_000
 older, and its timestamp is replaced by the time at which it is read."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible time by which a timestamp is later than the reading of its frame, ns."""
+"""Maximum plausible time (ns) by which a timestamp is later than the reading of its frame."""
 
 _IP_S: Final = 5.0
-"""Maximum duration of an ``ip link`` command, s."""
+"""Maximum duration (s) of an ``ip link`` command."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames per system call; 30 ms of traffic at 1 Mbit/s and full load."""
+"""Maximum number of frames per system call. A fully loaded 1 Mbit/s bus carries 256 frames in 30 ms."""
 
 
 class SocketReader:

@@ -85,7 +85,7 @@ class PatchApplication:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         return min(self._scan_ns, self.stream.deadline_ns)
 
     @property

@@ -23,8 +23,8 @@ COB_ID_MASK: Final = 0x7FF
 SYNC_CYCLIC_MAX: Final = 240
 """Highest cyclic synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types of PDOs that are sent only on a remote frame, with the values at the last SYNC (252) or
-at the remote frame (253)."""
+"""Transmission types of PDOs that are sent only on request by a remote frame. Their values are those at the
+last SYNC (252) or at the request (253)."""
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 

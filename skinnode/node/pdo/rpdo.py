@@ -83,7 +83,7 @@ class RpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Earliest time at which a monitored RPDO is overdue, ns."""
+        """Earliest time (ns) at which a monitored RPDO is overdue."""
         return self._timers.deadline_ns
 
     # --- parameters

@@ -15,8 +15,8 @@ An application can *claim* an object. It then owns all TPDOs whose first mapped 
 and sends them itself: SYNCs and events do not trigger them. The engine still counts SYNCs, answers remote
 frames and runs the event timers of these TPDOs.
 
-A SYNC takes time in proportion to the number of enabled TPDOs that SYNCs send or sample. A timer event takes
-time in proportion to the number of TPDOs that are due.
+The time to handle a SYNC is proportional to the number of enabled TPDOs that SYNCs send or sample. The time
+to handle a timer event is proportional to the number of TPDOs that are due.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class Tpdo:
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """Time at which the inhibit time ends, ns."""
+        """Time (ns) at which the inhibit time ends."""
         self.timer_ns = NO_DEADLINE_NS
-        """Time at which the event timer elapses, ns."""
+        """Time (ns) at which the event timer elapses."""
         self.waiting = False
         """Whether the TPDO is waiting for a SYNC or for the end of the inhibit time."""
         self.last: bytes | None = None
@@ -66,7 +66,7 @@ class Tpdo:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the event timer or the inhibit time of a waiting TPDO elapses, ns."""
+        """Time (ns) at which the event timer or the inhibit time of a waiting TPDO elapses."""
         held = self.waiting and self.parameters.event_driven
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
@@ -93,8 +93,8 @@ class Tpdo:
     def elapse(self, t_ns: int) -> None:
         """Restart the event timer after it has elapsed.
 
-        The new period begins when the last one ended or, after a delay of a whole period or more, at
-        ``t_ns``.
+        The new period begins at the end of the last one. After a delay of a whole period or more, it begins
+        at ``t_ns``.
         """
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
@@ -168,7 +168,7 @@ class TpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:

@@ -18,7 +18,7 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Maximum time to wait for the next request of a client before the transfer is aborted, ns. CiA 301 does not
+"""Maximum time (ns) to wait for the next request of a client before the transfer is aborted. CiA 301 does not
 specify this time-out."""
 
 _TOGGLE: Final = 0x10
@@ -59,7 +59,7 @@ class SdoServer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         return self._transfer.deadline_ns if self._transfer is not None else NO_DEADLINE_NS
 
     def reset(self) -> None:

@@ -26,7 +26,7 @@ class Channel:
     send: Callable[[bytes], None]
     """Function that sends a response of eight bytes."""
     timeout_ns: int
-    """Maximum time to wait for the next request of a client, ns."""
+    """Maximum time (ns) to wait for the next request of a client."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Transfer(ABC):
         self.target = target
         """Object to read or write."""
         self.deadline_ns = t_ns + channel.timeout_ns
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
 
     @abstractmethod
     def wants(self, request: bytes) -> bool:

@@ -26,8 +26,8 @@ _RIVAL_BEATS: Final = 3
 """Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. The other
 node may lose a heartbeat without ending the conflict."""
 _RIVAL_NS: Final = 750_000_000
-"""Duration of silence after which a node-ID conflict is considered resolved if this node sends no heartbeats,
-ns; three default heartbeat periods.
+"""Duration of silence (ns) after which a node-ID conflict is considered resolved if this node sends no
+heartbeats. It equals three default heartbeat periods.
 """
 
 

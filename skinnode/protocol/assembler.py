@@ -4,7 +4,7 @@
 *timeout* after the scan's first frame. The timeout is three periods, or less if the counter range is short.
 The first frame of a newer scan closes the open scan for good. Because counters repeat, a frame that is a
 whole counter cycle late could be mistaken for a frame of a later scan. This is impossible if every frame
-arrives within counter range × period − timeout after its SYNC. With the usual counter range of 240, this
+arrives less than counter range × period − timeout after its SYNC. With the usual counter range of 240, this
 limit is 237 periods.
 
 **Two scans with the same counter.** Two scans have the same counter if a node fails to increment it, or if
@@ -60,7 +60,7 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 class ScanAssembler:
-    """Assembles the scans of one patch. Each call returns at most one scan, in order of the scans.
+    """Assembles the scans of one patch. Each call returns at most one scan, and scans are in order.
 
     Call :meth:`poll` after each batch of frames, and at the time given by :meth:`next_deadline_ns`. It
     returns scans whose missing frames have timed out. If a frame closes two scans, the call that processes

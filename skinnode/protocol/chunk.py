@@ -171,7 +171,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return the (U, K) numbers of the chunks that carry each code, counted from 0 in sending order."""
+    """Return, for each of the (U, K) codes, the number of its chunk, counted from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within

@@ -61,7 +61,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame, which a crash before the next :meth:`flush` may lose."""
+        """Write a frame. Until the next :meth:`flush`, a crash may lose it."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()

@@ -69,7 +69,7 @@ def is_interface(config: BusConfig) -> bool:
 
 
 def allowed_interfaces(config: BusConfig) -> str:
-    """Return a text that lists all interfaces and suggests the closest match."""
+    """Return a text that lists the names of all interfaces and suggests the closest match."""
     known = ", ".join(sorted(can.VALID_INTERFACES))
     near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
     return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"

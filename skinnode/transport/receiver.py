@@ -164,7 +164,7 @@ class Intake:
         self._error = None
 
     def fetch(self, timeout_s: float) -> bool:
-        """Move the frames that have arrived from the port to the queue.
+        """Move all received frames from the port to the queue.
 
         Args:
             timeout_s: Maximum time to wait for a frame, s.

@@ -277,7 +277,7 @@ class Injected:
     error_passive: int = 0
     """Number of times the controller became error-passive."""
     twins: int = 0
-    """Number of times that a second node with the same node-ID was started."""
+    """Number of times a second node with the same node-ID was started."""
     twin_frames: int = 0
     """Number of frames sent by second nodes with the same node-ID."""
     restarts: int = 0

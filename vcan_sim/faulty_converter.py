@@ -15,7 +15,7 @@ from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
 MOST_DRIFT: Final = 10.0
-"""Limit of the factor by which drift multiplies or divides a resistance."""
+"""Maximum factor by which drift multiplies or divides a resistance."""
 WIRE_NOISE: Final = 3e-3
 """Noise of a resistance measured through a bad contact: relative standard deviation."""
 

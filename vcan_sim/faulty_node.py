@@ -41,7 +41,7 @@ _MOST_AT_ONCE: Final = 32
 
 
 TWIN_SERIAL: Final = 0x8000_0000
-"""Bit in which the serial numbers of the two nodes of the fault ``duplicate_node_id`` differ."""
+"""Bit that distinguishes the serial number of the second node from that of the first."""
 
 
 class Resting:
@@ -373,7 +373,7 @@ class FaultyNode(PatchNode):
 
     @property
     def _is_cut_off(self) -> bool:
-        """Whether the node is silent, unplugged or about to be reset, so that it sends nothing."""
+        """Whether the node cannot send, being silent, unplugged or about to be reset."""
         return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 

@@ -29,7 +29,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Return the name of at most one of several faults, drawn at random, or ""."""
+        """Draw at random whether one of several faults occurs, and return its name or ""."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""

@@ -14,7 +14,7 @@ def ease(share: float) -> float:
     Speed and acceleration are zero at both ends.
 
     Args:
-        share: Elapsed fraction of the duration. Values below 0 count as 0, and values above 1 as 1.
+        share: Elapsed fraction of the duration, clipped to the range 0 to 1.
     """
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10.0 + s * (6.0 * s - 15.0))
@@ -24,7 +24,7 @@ def glide(share: float) -> float:
     """Return a profile from 0 to 1 with constant speed between two smooth ramps.
 
     Args:
-        share: Elapsed fraction of the duration. Values below 0 count as 0, and values above 1 as 1.
+        share: Elapsed fraction of the duration, clipped to the range 0 to 1.
     """
     s = min(max(share, 0.0), 1.0)
     if s > 0.5:

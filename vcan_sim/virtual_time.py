@@ -36,7 +36,7 @@ START_WALL_NS: Final = 1_600_000_000_000_000_000
 READINGS: Final = 10_000
 """Number of clock readings without a wait after which a thread counts as polling."""
 POLL_S: Final = 1e-4
-"""Time for which each further clock reading suspends a polling thread, s."""
+"""Time by which each clock reading suspends a polling thread, s."""
 
 
 class Deadlock(RuntimeError):

@@ -76,7 +76,7 @@ class Layer:
         """Return the four amplitudes of the module docstring, in that order, multiplied by k (1/Pa).
 
         Args:
-            wave_number_per_m: Wave numbers k > 0, 1/m, of any shape.
+            wave_number_per_m: Array of wave numbers k > 0, 1/m.
         """
         nu, modulus = self.poisson, self.shear_modulus_pa
         kappa = 3.0 - 4.0 * nu

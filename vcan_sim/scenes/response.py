@@ -112,7 +112,7 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Tabulate displacement against distance from a point force; return the table and its step in metres.
+    """Return a table of displacement against distance from a point force, and its step in metres.
 
     The half-space solution is that of Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections 3.2
     and 3.6). :class:`vcan_sim.contact.layer.PointResponse` adds the correction for a layer.

@@ -50,7 +50,7 @@ _REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
     "press": (),
 }
 KEY_OF_TRAVEL: Final[dict[str, str]] = {"slide": "by_m", "shear": "by_m", "roll": "by_m", "walk": "reach_m"}
-"""Key that gives the displacement or distance of each kind of motion along the skin."""
+"""Key of the distance travelled, for each kind of motion along the skin."""
 
 _Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Place = Annotated[
@@ -81,7 +81,7 @@ _Poisson = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a
 
 
 class SkinConfig(Table):
-    """Elastic layer of every patch in the scene, bonded to a rigid base."""
+    """Elastic layer of the patches in the scene, bonded to a rigid base."""
 
     thickness_m: Length | None = None
     """Thickness of the elastic layer, metres; default: the height of the upper electrodes above the lower
@@ -193,9 +193,9 @@ class TouchConfig(Table):
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
     times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
-    """Number of times that the touch is performed, for example 5 for a series of five taps."""
+    """Number of times the touch is performed, such as 5 for a series of five taps."""
     every_s: _Duration | None = None
-    """Time (s) from the start of one repetition to the start of the next, if ``times`` is more than 1."""
+    """Interval between the starts of successive repetitions, s. Required if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
     """Motions of the body during the touch."""
 

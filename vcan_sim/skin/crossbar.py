@@ -144,7 +144,7 @@ def _driven(above: Float, upper: Side) -> Float:
 
 
 def _tridiagonal(diagonals: tuple[Float, Float], right: Float) -> Float:
-    """Solve a symmetric positive definite tridiagonal system for the columns of ``right``."""
+    """Solve a symmetric positive definite tridiagonal system, with right-hand sides in columns."""
     diagonal, beside = diagonals
     if not beside.any():
         return np.asarray(right / diagonal[:, None])

@@ -21,7 +21,7 @@ ROW_STEP_S: Final = 1e-3
 
 Surface = Callable[[float], Float]
 """Function from time (s) to the positions (U, N, 3) of an exact patch's upper electrodes (m). At rest, it
-returns the array ``layout.upper_m`` itself; :meth:`vcan_sim.scene.Scene.upper_m` is an example."""
+returns the array ``layout.upper_m`` itself. :meth:`vcan_sim.scene.Scene.upper_m` is such a function."""
 
 
 class PhysicalPatch:

@@ -1,6 +1,6 @@
 """Simulated CAN bus: arbitration, transmission attempts, error counters and events.
 
-On an idle bus, a frame starts at once; on a busy bus, it starts at the end of the intermission. A frame
+A frame starts at once if the bus is idle, and otherwise at the end of the intermission. A frame
 queued less than one bit time after a start of frame still takes part in the arbitration (Davis, Burns, Bril,
 Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). Arbitration is therefore
 decided one bit time after the start of frame.
@@ -266,7 +266,7 @@ class TimedBus:
 
     @property
     def only_sender(self) -> int | None:
-        """Index of the station with frames to send, if it is the only one; otherwise None."""
+        """Index of the station with frames to send, if there is exactly one; otherwise None."""
         senders = set(self._pending)
         if self._flight is not None:
             senders.update(self._flight.senders)

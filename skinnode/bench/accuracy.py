@@ -135,7 +135,7 @@ def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _print_noise(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\n10% press: error (reported std. dev.), divided by the displacement; conv.: fraction CONVERGED")
+    echo("\n10% press: error (reported std. dev.), relative to the displacement; conv.: fraction CONVERGED")
     echo(
         f"  {'layout':16}{'noise':>7}{'exact':>20}{'conv.':>7}{'posterior':>20}{'conv.':>7}"
         f"{'bound, no prior':>17}{'prototype: exact, posterior':>30}"
@@ -183,9 +183,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo(
-        "  forces and contacts of the posterior: RMS error (RMS reported), fraction inside the 95 % interval"
-    )
+    echo("  forces and contacts of the posterior: RMS error (reported RMS), coverage of the 95 % interval")
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"

@@ -26,7 +26,7 @@ def check_form(text: str, source: str) -> None:
 
     Args:
         text: content of the file.
-        source: name of the file for the error message.
+        source: name of the file, for the error message.
 
     Raises:
         ProfileError: if there is a format error. The message contains the line of the first error.

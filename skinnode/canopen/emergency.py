@@ -45,8 +45,8 @@ class EmcyCode(IntEnum):
 TOO_SLOW: Final = 1
 """Third detail byte of EMCY 0x8110 if scans were skipped because the node's computer or the bus is too slow.
 
-If the byte is 0, the scan period is too short to send the chunks at the inhibit time. The first two detail
-bytes are the number of skipped scans.
+If the byte is 0, the scan period is too short to send all chunks at intervals of the inhibit time. The first
+two detail bytes are the number of skipped scans.
 """
 
 _CODES: Final = {

@@ -98,9 +98,9 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
 def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
     """Encode resistances.
 
-    Infinite and NaN resistances are encoded as open, and zero and negative resistances as short. All others
-    are encoded as over-range if R/R0 is more than half a step outside the code range, or if R0 is not
-    positive and finite.
+    Resistances of +∞ and NaN are encoded as open, and zero and negative resistances as short. All others are
+    encoded as over-range if R/R0 is more than half a step outside the code range, or if R0 is not positive
+    and finite.
 
     Args:
         resistance_ohm: resistances, ohm; any shape.

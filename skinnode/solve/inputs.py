@@ -1,4 +1,4 @@
-"""Validation of a tracker's arguments. Wrong shapes raise an exception; resistances never do."""
+"""Validation of a tracker's arguments. Wrong shapes raise an exception; invalid resistances do not."""
 
 from __future__ import annotations
 

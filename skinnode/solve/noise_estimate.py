@@ -44,10 +44,10 @@ With an odd number, the median is the value of one block.
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
-"""Number of frames skipped after a block that agrees with a full window, and maximum number of frames skipped
-after rejected blocks.
+"""Number of frames skipped once a full window agrees with its last block.
 
-Without skipping, the noise estimate would take 8 % of the computing time of a patch at rest.
+This is also the maximum number of frames skipped after rejected blocks. Without skipping, the noise estimate
+would take 8 % of the computing time of a patch at rest.
 """
 REPEATED: Final = 0.15
 """Fraction of exactly repeated readings above which the contrasts of a block do not measure the noise.
@@ -66,7 +66,7 @@ DEVIATIONS: Final = 4.0
 The absolute value of a normal variable exceeds this margin with a probability of 1 in 16,000.
 """
 DEPARTED: Final = math.log(1.5)
-"""Minimum |ln(estimated noise / stated noise)| for the estimate to replace the stated noise."""
+"""Value of |ln(estimated noise / stated noise)| above which the estimate replaces the stated noise."""
 RETURNED: Final = math.log(1.25)
 """Value of |ln(estimated noise / stated noise)| below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
@@ -83,7 +83,7 @@ LEAST: Final = 1.0 / 30.0
 _CLIP: Final = 1.0
 """Limit at which Huber's proposal 2 clips squared values, in units of the variance.
 
-With a limit of 1, excessive noise on one upper and one lower wire (13 % of the readings) raises the noise
+With a limit of 1, additional noise on one upper and one lower wire (13 % of the readings) raises the noise
 estimate by 20 %.
 """
 _CLIPPED_MEAN: Final = 0.5160585
@@ -96,7 +96,8 @@ _ITERATIONS: Final = 30
 _ONE_CODE: Final = 12.5
 """Maximum squared contrast of a reading that changes by one code, in units of the quantization variance."""
 _HALF_A_CODE: Final = 4.0
-"""Variance of quantization plus noise of half a code, in units of the quantization variance."""
+"""Variance of the quantization error and a noise of half a code together, in units of the quantization
+variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
 
@@ -133,7 +134,7 @@ def _variance(squares: Float, count: int) -> float:
 def _contrasts(
     frames: Float, noise: Float, rounding_ohm: Float, quadratic: Float, cubic: Float
 ) -> tuple[int, int, int, float, float, float]:
-    """Write each changed reading's squared contrasts, divided by its stated variance.
+    """Write the squared contrasts of the changed readings, in units of the stated variance.
 
     The arguments are those of :func:`assess_block`.
 
@@ -264,7 +265,7 @@ class NoiseEstimate:
         return self.factor != before
 
     def _assess(self) -> None:
-        """Add the current block to the window and update :attr:`factor`; skip the block if it is rejected."""
+        """Add the current block to the window and update :attr:`factor`, unless the block is rejected."""
         count, slow, fast, share = assess_block(
             self._frames, self._noise, self._rounding_ohm, self._work[0], self._work[1]
         )

@@ -1,10 +1,10 @@
-"""Checks of the roots found by the exact inverse, with the posterior.
+"""Checks of the roots found by the exact inverse; the posterior confirms, replaces or rejects them.
 
 A root is doubtful in three cases: an electrode moved too far since the previous frame, the displacement is
 too rough for a press, or a press can move the wire across a fold, where two roots of F = b merge. Near a
 fold, the exact inverse cannot tell which of two roots is the correct one. A wire without a root is doubtful
-too. The posterior estimates the positions from all wires of the patch, and this estimate confirms, replaces
-or rejects each doubtful root. :mod:`skinnode.solve.roots` defines the thresholds.
+too. The posterior, which estimates the positions from all wires of the patch, decides about each doubtful
+root. :mod:`skinnode.solve.roots` defines the thresholds.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class RootGate:
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # remaining number of frames without a posterior solve
         self.hurried = False
-        """Whether the last check ended before all doubtful roots were checked, for lack of time."""
+        """Whether the last call of :meth:`check` had too little time to check all doubtful roots."""
         self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, m
         self._apart = np.zeros((len(problem.rest), 1, 1))  # addition to the standard deviation, m; see APART
         self._any_apart = False
@@ -153,7 +153,7 @@ class RootGate:
         return field
 
     def _doubtful(self) -> bool:
-        """Find wires with a doubtful root or none; return whether there are any."""
+        """Find the wires that have a doubtful root or no root; return whether there are any."""
         found = check_roots(self._root_check.table)
         if found & SOME_ROUGH:
             if self._confirmed is not None:

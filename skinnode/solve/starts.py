@@ -3,10 +3,10 @@
 ``guided_start`` computes the maximum a posteriori estimate of a displacement, with a smoothness prior and
 with noise that decreases from one Gauss-Newton step to the next (Tarantola 2005, section 3.4).
 
-``near_twin`` estimates the twin of a root, which is the root on the other side of the nearest fold. With the
-smallest singular value σ of J and its left and right vectors w and v, the second-order condition for a root
-at x + α v is σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer
-1985, chapter I.3).
+``near_twin`` estimates the twin of a root, which is the root on the other side of the nearest fold. Let σ be
+the smallest singular value of J at the root x, with the left vector w and the right vector v. To second
+order, x + α v is a root if σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
+(Golubitsky & Schaeffer 1985, chapter I.3).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ eps^(1/3) = 6e-6, which makes rounding errors negligible."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
-    """Return a starting point near the likeliest root of a F = 1, and the cost of computing it.
+    """Compute a starting point near the likeliest root of a F = 1.
 
     Args:
         problem: The patch.

@@ -35,7 +35,7 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Invalid code that replaces the code of a reading to be ignored; no converter sends it."""
+"""Invalid code, sent by no converter, that replaces the code of a reading to be ignored."""
 EXACT_STD: Final = 0.0025
 """RMS standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` selects ``exact``.
 
@@ -115,7 +115,7 @@ class Tracker:
         self._posterior.check.prepare()
 
     def reset(self) -> None:
-        """Discard the state of the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream; the solve of the next frame starts at the rest position."""
         self._posterior.reset()
         if self._exact is None:
             return
@@ -133,8 +133,8 @@ class Tracker:
     ) -> FieldFrame:
         """Compute the displacement field of one frame.
 
-        No resistance raises an exception. A wire that cannot be solved keeps its last trusted position, with
-        an infinite standard deviation and a status other than CONVERGED.
+        Invalid resistances do not raise an exception. A wire that cannot be solved keeps its last trusted
+        position, with an infinite standard deviation and a status other than CONVERGED.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
@@ -208,7 +208,7 @@ class Tracker:
             self._check.scan = number
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
-        """Check the readings behind an exact field; return the field with its faults and trust."""
+        """Test the readings of an exact field; return the field with its data faults and trust attributes."""
         exact = self._exact
         assert exact is not None
         its = exact.arrays

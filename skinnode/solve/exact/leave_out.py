@@ -14,11 +14,11 @@ other electrode moved. To first order at rest, this is √(quantile − degrees 
 the component of the coordinate's column of J that is orthogonal to the columns of the unknowns and to the
 other columns of the same electrode.
 
-Each option makes an assumption about the skin. If it is violated, the standard deviations of the unknowns are
-invalid. The χ² test reliably detects violations of active_only. It is less sensitive to violations of
-normal_only, because smooth shear resembles a gradient of z. For example, on the staggered layout (h = 0.5,
-noise 1e-5), the test rejected a strong Hertzian press whose shear was 30 % of its depth. It accepted a weaker
-press, in which the errors in z reached 16 standard deviations (0.2 % of h).
+Each option makes an assumption about the skin. If the assumption is violated, the standard deviations of the
+unknowns are invalid. The χ² test reliably detects violations of active_only. It is less sensitive to
+violations of normal_only, because smooth shear resembles a gradient of z. For example, on the staggered
+layout (h = 0.5, noise 1e-5), the test rejected a strong Hertzian press whose shear was 30 % of its depth. It
+accepted a weaker press, in which the errors in z reached 16 standard deviations (0.2 % of h).
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class LeftOut:
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
-        """Compute the smallest detectable movement of each fixed coordinate of wire u."""
+        """Compute the smallest detectable movement of each fixed coordinate of wire u, per unit of σ."""
         solver, (_, lower) = self._stream.solver, self._layout.shape
         self._unnoticed_weight[u] = weight
         unnoticed = self._unnoticed[u].reshape(-1, 3)

@@ -7,7 +7,7 @@ Each wire passes through these stages until one of them finds a root of F = b:
 - follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough (module ``follow``);
 - correct: iterate the operator to a tolerance far below any noise (module ``correct``);
 - widen: make a fixed electrode an unknown if it seems to move (module ``leave_out``);
-- recover: make further attempts if no root was found (module ``recover``).
+- recover: make further attempts if no root was found (module ``recover_lost_wires``).
 
 :mod:`skinnode.solve.roots` defines which roots are acceptable.
 """
@@ -104,7 +104,7 @@ class ExactTracker:
         problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
         self.untouched_force_n: Float | None = None
-        """(U, N, 3) forces reported if no stiffness is given: those on an untouched patch, N."""
+        """(U, N, 3) forces on an untouched patch, N; reported if no stiffness is given."""
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
@@ -132,7 +132,7 @@ class ExactTracker:
         self._noise_estimate = noise_estimate
 
     def reset(self) -> None:
-        """Discard the state of the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream; the solve of the next frame starts at the rest position."""
         self._stream.reset()
         self._left_out.reset()
         self.arrays.order[:], self._waiting = self._in_order, False
@@ -155,10 +155,10 @@ class ExactTracker:
             left_out: (U, K) bool, True for valid readings that the solve ignores. The noise estimate uses
                 them.
 
-        No resistance raises an exception. A wire that cannot be solved keeps its last trusted position, with
-        an infinite standard deviation and the residual at that position; after the deadline, the residual is
-        inf. A wire with fewer usable resistances than unknowns is NON_FINITE if any valid resistance is out
-        of range, otherwise ILL_CONDITIONED. Raises ValueError if a shape is wrong.
+        Invalid resistances do not raise an exception. A wire that cannot be solved keeps its last trusted
+        position, with an infinite standard deviation and the residual at that position; after the deadline,
+        the residual is inf. A wire with fewer usable resistances than unknowns is NON_FINITE if any valid
+        resistance is out of range, otherwise ILL_CONDITIONED. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays
@@ -279,7 +279,7 @@ class ExactTracker:
         return residual
 
     def _complete(self) -> None:
-        """Write the missing ``a`` of each solved wire to ``a_solved``, as predicted by its solution."""
+        """Write the values of ``a`` that each solution predicts for missing readings to ``a_solved``."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -287,7 +287,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Replace the last solutions of the wires in the mask (U,) with displacements (U, N, 3), m."""
+        """Use the given displacements (U, N, 3), m, as the last solutions of the wires in the mask (U,)."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # solve for all electrodes of these wires again

@@ -64,8 +64,10 @@ class PathResult:
     status: tuple[Status, ...]
     """Status of each upper wire."""
     error_estimate_m: Float
-    """(U,) estimate of the largest coordinate error due to the tolerance and to rounding, metres; inf if
-    unknown. Errors of the samples are not included."""
+    """(U,) estimate of the largest coordinate error, metres; inf if unknown.
+
+    The estimate covers the tolerance and rounding, but no errors of the samples.
+    """
     residual: Float
     """(U,) RMS of the relative residual F/b − 1 at the last sample."""
     cycle: int | None
@@ -96,7 +98,7 @@ def solve_path(
     """Follow a press from the rest position to its last sample.
 
     F = b has several roots, separated by folds (det J = 0). If a root may be wrong, the status of the wire is
-    ILL_CONDITIONED instead of CONVERGED. There are four reasons for such a doubt:
+    ILL_CONDITIONED instead of CONVERGED. There are four such cases:
 
     - the determinant of the Jacobian changed sign on the path;
     - an electrode moved farther than its distance at rest from the nearest lower electrode;

@@ -29,7 +29,7 @@ from skinnode.solve.wires.problem import PatchProblem
 
 @dataclass(slots=True, eq=False)
 class PathEnd:
-    """Outcome of the solve of the last sample."""
+    """Outcome of solving the last sample."""
 
     status: Index
     """(U,) status codes."""
@@ -261,7 +261,7 @@ class PathTracker:
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())
 
     def led_elsewhere(self) -> Mask:
-        """Return a mask (U,) of the wires that are no longer at the root at the end of their smooth path.
+        """Return a mask (U,) of the wires that have left the root to which a smooth path led.
 
         A path is smooth if each solution is close to the position predicted by the secant through the two
         previous ones, and the first solution is close to the rest position

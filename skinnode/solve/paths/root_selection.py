@@ -54,9 +54,9 @@ def doubtful(tracker: PathTracker) -> Mask:
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again, starting at the smoothest displacement that explains it.
 
-    If the new root is across a fold, its twin on the side of the rest position is used instead. Of the old
-    and the new root of a wire, the smoother one is kept. If no new root is found, the wire is not CONVERGED,
-    even if it was before.
+    If the new root is across a fold, its twin on the same side as the rest position is used instead. Of the
+    old and the new root of a wire, the smoother one is kept. If no new root is found, the wire is not
+    CONVERGED, even if it was before.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -205,10 +205,11 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
 
     If the skin itself has crossed a fold, a wrong root on the near side can be smoother and likelier than the
     correct root. Then :func:`guide` and the posterior find the wrong root, and only the path leads to the
-    correct one. If this happens to any wire, every other root away from the end of its path is rejected too.
+    correct one. If any root is rejected for this reason, so is every other root that is not at the end of its
+    path.
     """
     if not tracker.second_tries:
-        return  # every wire is already at the end of its path
+        return  # the wires have not left the ends of their paths
     todo = tracker.led_elsewhere()
     if todo.any():
         moved = ~tracker.at_path_end()

@@ -24,7 +24,7 @@ from skinnode.solve.wires.problem import PatchProblem
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-# Columns of the integer report on a wire. SPARE is the number of equations minus the number of unknowns.
+# Columns of the integer report on a wire. SPARE is the number of equations in use minus that of unknowns.
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
 # Columns of the floating-point report on a wire. RESIDUAL is the weighted RMS residual of the equations in
 # use. CHI2 is the χ² of the final residual, with SPARE degrees of freedom.

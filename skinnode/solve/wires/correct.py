@@ -46,7 +46,8 @@ from skinnode.solve.wires.arrays import (
 from skinnode.solve.wires.hold import chi2_quantile_part
 
 DATA_ROUNDING: Final = 2.0
-"""Relative rounding error of a F, in units of eps: eps/2 each for R, the gain, their product and F."""
+"""Relative rounding error of the product a F, in units of eps: half a unit each for R, the gain, their
+product and F."""
 
 Z_95_ONE_SIDED: Final = 1.645
 """95 % quantile of the standard normal distribution."""
@@ -54,7 +55,7 @@ Z_95_ONE_SIDED: Final = 1.645
 
 @njit_part
 def _data_rounding(inverse: Float, weight: Float) -> float:
-    """Return the largest error of a coordinate due to the rounding error of a F."""
+    """Return the largest coordinate error caused by rounding of a F."""
     top = 0.0
     for j in range(inverse.shape[0]):
         row, total = inverse[j], 0.0

@@ -9,7 +9,7 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Random generator and counter of the faults of one node.
+    """Fault injector of one node, which draws faults at random and counts them.
 
     The random sequence is reproducible: it depends only on the seed, the node-ID and the order of calls. Any
     thread may assign :attr:`faults` at any time.

@@ -9,7 +9,7 @@ GLIDE_RAMP: Final = 0.2
 
 
 def ease(share: float) -> float:
-    """Return a minimum-jerk profile from 0 to 1 (Flash and Hogan 1985).
+    """Return the value of a minimum-jerk profile that rises from 0 to 1 (Flash and Hogan 1985).
 
     Speed and acceleration are zero at both ends.
 
@@ -21,7 +21,7 @@ def ease(share: float) -> float:
 
 
 def glide(share: float) -> float:
-    """Return a profile from 0 to 1 with constant speed between two smooth ramps.
+    """Return the value of a profile that rises from 0 to 1, at constant speed between two smooth ramps.
 
     Args:
         share: Elapsed fraction of the duration, clipped to the range 0 to 1.

@@ -51,8 +51,8 @@ class Window:
     Attributes:
         grid: Grid of the cells, with their elastic response.
         half_m: Half widths of the deepest contact along x and y, metres.
-        deepest_m: Depth of the deepest contact without friction, metres.
-        force_n: Normal force of the deepest contact without friction, N.
+        deepest_m: Depth of the deepest contact, metres, computed without friction.
+        force_n: Normal force of the deepest contact, N, computed without friction.
     """
 
     grid: Grid
@@ -149,7 +149,7 @@ def solve_depth(
     Args:
         force_n: Function from depth (m) to force (N). Its last call is made with the returned depth.
         target_n: Target force, N, positive.
-        known: Depth (m) and force (N) from which F ∝ δ^1.5 extrapolates the first trial depth.
+        known: Known depth (m) and force (N). The first trial depth follows from them with F ∝ δ^1.5.
         close: Tolerance of the force, relative to the target.
 
     Raises:

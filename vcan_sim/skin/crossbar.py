@@ -89,7 +89,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     resistance of the crossing.
 
     Args:
-        conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
+        conductance: (upper nodes, lower nodes) float64, S: conductances of the paths between nodes.
         upper: Upper wires.
         lower: Lower wires.
     """
@@ -115,7 +115,7 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     conductance matrix of the network (Klein and Randić, J. Math. Chem. 12, 1993).
 
     Args:
-        conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
+        conductance: (upper nodes, lower nodes) float64, S: conductances of the paths between nodes.
         upper: Upper wires.
         lower: Lower wires.
     """

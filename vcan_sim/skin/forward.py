@@ -35,7 +35,7 @@ class ExactForward:
     Args:
         shape: (U, N, K, M): numbers of upper wires, electrodes on each, lower wires, and electrodes on each.
         lower_m: (K, M, 3) float64, m: lower electrodes.
-        resistivity_ohm_per_m: Path resistance per metre between two electrodes, ohm/m.
+        resistivity_ohm_per_m: Resistance of a path per metre between its electrodes, ohm/m.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
 """Simulated CAN bus: arbitration, transmission attempts, error counters and events.
 
-A frame starts at once if the bus is idle, and otherwise at the end of the intermission. A frame
-queued less than one bit time after a start of frame still takes part in the arbitration (Davis, Burns, Bril,
-Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). Arbitration is therefore
-decided one bit time after the start of frame.
+A frame starts at once if the bus is idle, and otherwise at the end of the intermission. A frame queued less
+than one bit time after a start of frame still takes part in the arbitration (Davis, Burns, Bril, Lukkien,
+"Controller Area Network (CAN) schedulability analysis", 2007, section 3). Arbitration is therefore decided
+one bit time after the start of frame.
 
 The model has no propagation delay and no oscillator tolerance: all stations see each bit at the same time.
 """

@@ -69,7 +69,7 @@ def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     noise = broadcast_noise(relative_noise, layout)
     if not ((noise > 0) & (noise < np.inf)).all():
         worst = noise[~((noise > 0) & (noise < np.inf))][0]
-        raise ValueError(f"relative_noise: got {worst}, must be positive and finite everywhere")
+        raise ValueError(f"relative_noise: got {worst}, must be positive and finite")
     return noise
 
 

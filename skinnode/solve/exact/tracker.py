@@ -98,7 +98,7 @@ class ExactTracker:
         if layout.shape[1] < unknowns:
             raise ValueError(
                 f"layout: got {layout.shape[1]} lower wires for {unknowns} unknowns per upper wire, "
-                "must be at least as many"
+                "must have at least as many lower wires as unknowns"
             )
         self.layout = layout
         problem = PatchProblem.of(layout, baseline_ohm)

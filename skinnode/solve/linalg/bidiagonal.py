@@ -23,9 +23,9 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
     elements of A must not overflow.
 
     Args:
-        a: A, padded with zeros to (n + 3, m), m rounded up to whole SIMD vectors. The padding allows loops to
-            process four rows and whole vectors at a time. Overwritten: row k becomes the vector v of
-            the k-th reflector I − β v vᵀ of Q.
+        a: A, padded with zeros to (n + 3, m), with m rounded up to whole SIMD vectors. The padding allows
+            loops to process four rows and whole vectors at a time. Overwritten: row k becomes the vector v
+            of the k-th reflector I − β v vᵀ of Q.
         left: (n, n + 3) output, padded like ``a``: row k is the vector v of the k-th reflector of P.
         diagonal: (n,) output: diagonal of B.
         upper: (n,) output: superdiagonal of B, followed by 0.

@@ -104,10 +104,7 @@ class Attempt:
 
     @property
     def decided(self) -> bool:
-        """Whether no further attempt is needed.
-
-        This is the case if the start was invalid, or the attempt ended at a root, minimum or flat point.
-        """
+        """Whether the result of this attempt is final: an invalid start, or a root, minimum or flat point."""
         return self.went in (op.CONVERGED, op.INVALID_START) or self.kind in (PointKind.ROOT, PointKind.FLAT)
 
     def run(self, steps: int, tol_f: float, tol_x: float) -> None:

@@ -130,10 +130,10 @@ def solve_path(
     if layout.shape[1] < layout.unknowns:
         raise ValueError(
             f"layout: got {layout.shape[1]} lower wires for {layout.unknowns} unknowns per upper wire, "
-            "must be at least as many"
+            "must have at least as many lower wires as unknowns"
         )
     if schedule is not None and (isinstance(schedule, type) or not hasattr(schedule, "follow")):
-        raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic(), Adaptive() or similar")
+        raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic() or another Schedule")
     problem = PatchProblem.of(layout, baseline_ohm)
     start = perf_counter()
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # the status reports divergence

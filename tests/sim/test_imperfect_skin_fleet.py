@@ -11,23 +11,25 @@ import pytest
 from skinnode.config import HandConfig, SimulationConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Host
-from skinnode.model.layout import PatchLayout
+from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.fleet import Fleet
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
+from vcan_sim.virtual_time import VirtualClock
 
 S = 1_000_000_000
 ORDINARY = Imperfections.ordinary(seed=3)
 
 
-def hand(patches: int = 1, **simulation: object) -> HandConfig:
+def hand(
+    patches: int = 1, *, period_ms: int = 100, interface: str = "virtual", **simulation: object
+) -> HandConfig:
     return parse_hand(
         {
-            "buses": [{"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}],
-            "sync": {"period_ms": 100},
-            "stream": {"partial": "withhold"},  # a busy machine loses chunks, which is not at issue
+            "buses": [{"name": "can0", "interface": interface, "channel": uuid.uuid4().hex[:8]}],
+            "sync": {"period_ms": period_ms},
             "patches": [
                 {"name": f"p{i}", "node_id": 5 + i, "tolerances": "ordinary"} for i in range(patches)
             ],
@@ -85,19 +87,20 @@ def test_one_for_all_patches_or_by_name() -> None:
         Fleet(plan, imperfections={"p7": ORDINARY})
 
 
-@pytest.mark.real_time
-def test_the_host_is_right_about_an_ordinary_patch() -> None:
-    """Its tolerances are stated, so every field is trusted and within five of its standard deviations."""
-    plan = hand(cycle_s=2.0)
-    worst: list[float] = []
-    with Fleet(plan, imperfections=ORDINARY) as fleet, Host.from_config(plan) as host:
+@pytest.mark.parametrize("period_ms", [100, 700])  # frames of 700 ms have little in common
+def test_the_host_is_right_about_an_ordinary_patch(period_ms: int) -> None:
+    """With stated tolerances, fields are trusted, and 1 value in 1000 at most is beyond five deviations."""
+    plan = hand(period_ms=period_ms, interface="timed", cycle_s=2.1)
+    deviations: list[Float] = []
+    with VirtualClock(), Fleet(plan, imperfections=ORDINARY) as fleet, Host.from_config(plan) as host:
         for field in host.fields(timeout_s=60, capacity=1000):
             assert field.stamp is not None
             truth_m = fleet.displacement_m("p0", field.stamp.device_time_us)
             if np.abs(truth_m).max() > 50e-6:
                 assert field.trusted, field.distrust
-                worst.append(float((np.abs(field.displacement_m - truth_m) / field.displacement_std_m).max()))
-            if len(worst) == 15:
+                deviations.append(np.abs(field.displacement_m - truth_m) / field.displacement_std_m)
+            if len(deviations) == 40:
                 break
-    assert max(worst) < 5.0
-    assert max(worst) > 1.0  # a claim that covers everything would be no use
+    beyond = np.mean(np.array(deviations) > 5.0)
+    assert beyond <= 1e-3
+    assert np.max(deviations) > 1.0  # a claim that covers everything would be no use

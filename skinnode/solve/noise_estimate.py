@@ -11,16 +11,17 @@ A block is rejected if the skin moved. Two tests detect motion:
 
 - Slow motion, a step or a lost scan makes the variances of the two contrasts unequal. Slow motion makes the
   quadratic contrast the larger one.
-- Motion gives the contrasts of neighbouring crossings the same sign. The signs of noise are independent.
+- Motion gives the contrasts of neighbouring crossings the same sign, whereas noise gives them independent
+  signs.
 
 The variance of a block is a robust mean over its readings (Huber, Robust Statistics, 1981, proposal 2), which
 limits the influence of bad readings and of a touch on a few wires. The estimate is the median over the last
 blocks, which limits the influence of a single block.
 
 Readings that repeat exactly are left out, because they do not tell a quiet converter from a frozen one. If
-the quantization error is known, the factor applies only to the noise before the converter. If many
-codes repeat and the others change by only one code, the noise is at most half a code, and the estimator
-assumes half a code.
+many codes repeat and the others change by only one code, the noise is at most half a code, and the estimator
+assumes half a code. If the quantization error is known, the factor applies only to the noise before the
+converter.
 """
 
 from __future__ import annotations

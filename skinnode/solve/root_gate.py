@@ -107,7 +107,7 @@ class RootGate:
         return roots.folded_wires(layout, normal_only)
 
     def set_noise(self, factor: float) -> None:
-        """Set the factor that scales the stated noise; it applies from the next frame."""
+        """Set the factor that scales the stated noise; it takes effect in the next frame."""
         self._folded[:] = self._folded_with(factor)
         self._root_check.folded[:] = self._folded
 

@@ -49,8 +49,8 @@ UNTOUCHED: Final = 4.0
 Noise alone exceeds this limit in 2 % of the frames, which are then searched for contacts.
 """
 WILD: Final = 16.0
-"""Ratio of a wire's variance to the median variance of the wires above which the wire is left out. All
-variances are relative to their values at rest."""
+"""Ratio of a wire's variance to the median over all wires above which the wire is left out. All variances are
+relative to their values at rest."""
 SCALE_STEPS: Final = 30
 """Maximum number of fixed-point iterations for s²."""
 SCALE_CLOSE: Final = 0.01

@@ -109,7 +109,7 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Add unknowns to the processed wires whose residual exceeds noise; return a mask of them (U,).
+        """Add unknowns to processed wires whose residual exceeds noise; return a mask (U,) of these wires.
 
         Args:
             frame: The current frame.

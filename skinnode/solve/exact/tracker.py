@@ -39,7 +39,7 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Upper bound on the time of one solver step, including one evaluation of F and J, s.
+"""Upper bound on the time of one solver step, including one evaluation of F and J, seconds.
 
 Each call of the solver processes all wires that are certain to finish before the deadline. Ten calls instead
 of one would cost as much extra time as solving ten more wires.
@@ -63,7 +63,7 @@ class ExactTracker:
             the forces F.
         hold: Whether to keep the last position of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed it by the time of one wire's solve.
+        deadline_us: Time limit of an update, µs; an update can exceed it by the time that one wire takes.
             Wires not processed by the deadline have the status DEADLINE and an infinite standard deviation,
             and are processed first in the next frame.
         normal_only: Whether to fix x and y at rest and solve for z only.

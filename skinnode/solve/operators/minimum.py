@@ -33,7 +33,7 @@ at isolated minima. The exception is Watson's problem with n = 12: because of ro
 the minimum.
 """
 CONTRACTION: Final = 0.5
-"""Maximum ratio of successive Newton steps that still converge."""
+"""Ratio of the sizes of successive Newton steps above which the iteration ends."""
 NEWTON_STEPS: Final = 8
 """Maximum number of Newton steps to a minimum. With quadratic convergence, 4 steps suffice from an error of
 1 %."""
@@ -166,6 +166,6 @@ def settle(
         if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
             break
         before, at = size, Point(x, r, jacobian(x))
-    # Near the limit set by rounding errors, the steps no longer contract, although Jᵀr is as good as zero.
+    # If Jᵀr consists of rounding errors only, the steps no longer contract, but the point is stationary.
     known = bent.positive and (reached or at.cosine <= STATIONARY)
     return Settled(at, bent.lowest, size + bent.error if known else math.inf)

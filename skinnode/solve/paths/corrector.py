@@ -90,7 +90,7 @@ class Corrector:
         return np.asarray(self._knots[sample + 1])
 
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
-        """Log the evaluations (U,) that computed starting points for the wires in the mask (U,)."""
+        """Log the numbers of evaluations (U,) for the starting points of the wires in the mask (U,)."""
         nothing = np.full(len(evaluations), math.nan)
         self._rows.append((np.where(wires_, self.last, nothing), evaluations, evaluations, nothing))
 

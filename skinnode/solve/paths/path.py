@@ -66,7 +66,7 @@ class PathResult:
     error_estimate_m: Float
     """(U,) estimate of the largest coordinate error, metres; inf if unknown.
 
-    The estimate covers the tolerance and rounding, but no errors of the samples.
+    The estimate includes errors due to the tolerance and to rounding, but not errors in the samples.
     """
     residual: Float
     """(U,) RMS of the relative residual F/b − 1 at the last sample."""

@@ -47,7 +47,7 @@ class PatchEstimate:
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return a mask (U,) of the wires that have no root, a root too rough for a press, or an undone step."""
+    """Return a mask (U,) of the wires with no root, a root too rough for a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 

@@ -39,7 +39,7 @@ SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) Δa, where Δa is the change in a since the last solve."""
 HOLD: Final = 3
-"""Keep x if the residual at x does not exceed the noise; otherwise as PREDICT."""
+"""Keep x if the residual at x does not exceed the noise; otherwise, do the same as for PREDICT."""
 
 # Optional tasks of a solve; combine them with bitwise OR
 COVARIANCE: Final = 1

@@ -5,8 +5,8 @@ have changed by no more than their noise. The test uses the residuals ρ_k = a_k
 known from the solve for x. The wire is held if Σ (ρ_k/σ_k)² is below its 99 % quantile.
 
 The noise of two frames contributes to ρ. The noise of the current frame has the variance σ². The noise of the
-frame for which x was solved has the variance s², but only in the n dimensions of the range of J. With
-t = s²/σ², the sum has the mean K + n t and the variance 2 (K + 2 n t + n t²). The quantile is that of a
+frame for which x was solved has the variance s², and contributes only in the n dimensions of the range of J.
+With t = s²/σ², the sum has the mean K + n t and the variance 2 (K + 2 n t + n t²). The quantile is that of a
 scaled distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
 The test can miss a slow movement, so the variance of a held coordinate includes an estimate of the movement.

@@ -6,8 +6,8 @@ with an elastic prior. The default method, ``auto``, selects ``exact`` if the no
 (:mod:`skinnode.solve.root_gate`).
 
 The tracker estimates the noise of the stream and corrects the stated noise
-(:mod:`skinnode.solve.noise_estimate`). With ``auto``, it changes the method when the estimated noise crosses
-the limit for ``exact``. The new method starts at the rest position.
+(:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker changes the method when the estimated noise
+crosses the limit for ``exact``. The new method starts at the rest position.
 """
 
 from __future__ import annotations

@@ -152,8 +152,8 @@ class ExactTracker:
             relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
                 default: as in the constructor. A resistance is ignored if its standard deviation is not
                 positive and finite.
-            left_out: (U, K) bool, True for valid readings that the solve ignores. The noise estimate uses
-                them.
+            left_out: (U, K) bool, True for valid readings that the solve ignores. The noise estimate still
+                uses them.
 
         Invalid resistances do not raise an exception. A wire that cannot be solved keeps its last trusted
         position, with an infinite standard deviation and the residual at that position; after the deadline,

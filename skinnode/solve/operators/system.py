@@ -74,7 +74,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
         jacobian: Function that returns ∂r/∂x (m, n) for x (n,).
         x0: (n,) starting point.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
-        tol_f: Maximum |r| at a root. At a minimum, maximum of ‖P r‖ / ‖r‖, where P projects onto the range of
+        tol_f: Limit of max|r| at a root, and of ‖P r‖ / ‖r‖ at a minimum, where P projects onto the range of
             J.
         tol_x: Maximum size of the last Newton correction, relative to max(1, max|x|).
         max_steps: Maximum number of trial steps of all attempts together, including rejected steps.

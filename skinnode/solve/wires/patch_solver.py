@@ -47,7 +47,7 @@ STORE: Final = 32
 # Flags that a call returns, combined with bitwise OR
 ALL_GOOD: Final = 1
 INCOMPLETE: Final = 2
-"""A trusted solution was stored that left out an equation, because its weight was 0."""
+"""A new trusted solution was stored in which the weight of some equation was 0."""
 
 REST_TOLERANCE: Final = 1e-9
 """Tolerance of the solve at the rest position, where the residual consists of rounding errors only."""

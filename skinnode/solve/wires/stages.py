@@ -102,7 +102,7 @@ def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
 def store(solver: SolverArrays, frame: FrameArrays) -> bool:
     """Make each good solution the last trusted solution; store the displacements and standard deviations.
 
-    Returns whether any new trusted solution left out an equation, because its weight was 0.
+    Returns whether the weight of any equation was 0 in a new trusted solution.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

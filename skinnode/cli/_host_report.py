@@ -96,7 +96,7 @@ def _bus_faults(running: Host, stats: HostStats) -> list[str]:
         if bus.no_sync:
             faults.append(f"{name}: no SYNC received from its master")
         if bus.controller in ("error warning", "error passive", "bus-off"):
-            faults.append(f"{name}: its controller is {bus.controller} at the end")
+            faults.append(f"{name}: CAN controller {bus.controller} at the end")
     return faults
 
 

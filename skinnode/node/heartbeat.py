@@ -144,7 +144,7 @@ class HeartbeatConsumer:
         )
 
     def _guard(self, subindex: int, value: int) -> None:
-        """Refuse a second entry for one node. Entries with node-ID 0 or heartbeat time 0 are unused."""
+        """Reject a second entry for the same node. Entries with node-ID 0 or heartbeat time 0 are unused."""
         if value >> 24:
             raise Refused(AbortCode.INVALID_VALUE)
         node_id, time_ms = value >> 16, value & 0xFFFF

@@ -68,7 +68,7 @@ class Storage:
 
     @property
     def kept(self) -> Kept:
-        """Content of the memory; empty if the memory has no usable content."""
+        """Contents of the memory; empty if the memory has no usable contents."""
         return self._kept
 
     @property
@@ -77,7 +77,7 @@ class Storage:
         return self._memory is not None
 
     def load(self) -> None:
-        """Load the content of the memory at power-on. Unusable content is treated as empty."""
+        """Load the memory contents at power-on. Unusable contents are treated as empty."""
         patch = self._kept.patch
         self._kept, self._unreported, self._lasting, self.problem = Kept(patch), [], {}, ""
         try:
@@ -202,7 +202,7 @@ class Storage:
         return kept if whole else _unverified(kept)
 
     def _forget(self, subindex: int) -> Kept:
-        """Return the content of the memory without its saved parameters."""
+        """Return the memory contents without the saved parameters."""
         kept = _unverified(self._kept)
         if subindex in (_ALL, _COMMUNICATION_ONLY):
             kept = replace(kept, communication=Parameters())

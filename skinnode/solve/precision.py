@@ -23,7 +23,7 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 MULTIPLE: Final = 15.0
-"""Default limit of a standard deviation, divided by the RMS standard deviation of the exact inverse at rest.
+"""Default limit on a standard deviation, as a multiple of the exact inverse's RMS standard deviation at rest.
 
 In 2,640 simulated fields of healthy patches (ten layouts, relative noise 3e-6 to 1e-3, presses of 5 to 30 %),
 the largest ratio was 12.2.
@@ -43,7 +43,7 @@ simulated presses with a relative noise of at most 1e-5, ordinary tolerances cau
 to 0.028 clearances.
 """
 FORCE_SHARE: Final = 0.3
-"""Default limit of a normal force's standard deviation, divided by modulus · clearance · pitch.
+"""Default limit on a normal force's standard deviation, in units of modulus · clearance · pitch.
 
 In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1. It reached 0.26 in presses of 50 %
 that were half outside the patch.

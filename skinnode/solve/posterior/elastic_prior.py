@@ -91,8 +91,9 @@ class ElasticPrior:
 def bonded_response(layout: PatchLayout) -> Float:
     """Return the response (3UN, Q) of a bonded layer to normal loads, pitches per unit load.
 
-    The layer is incompressible, and its thickness equals the height of the electrodes. No other support
-    differs more from a half-space: around a contact, the surface moves outwards rather than downwards. For
+    The layer is incompressible, and its thickness equals the height of the electrodes. Of all supports,
+    this one differs most from a half-space: around a contact, the surface moves sideways, away from the
+    contact, rather than downwards. For
     loads with a standard deviation of 1, the median standard deviation of the normal displacement is
     :data:`LAYER_SHARE` pitches.
     """

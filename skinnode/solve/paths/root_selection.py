@@ -55,8 +55,8 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again, starting at the smoothest displacement that explains it.
 
     If the new root is across a fold, its twin on the same side as the rest position is used instead. Of a
-    wire's old and new solution, the one with the smoother displacement is kept. If no new root is found, the wire is not
-    CONVERGED, even if it was before.
+    wire's old and new solution, the one with the smoother displacement is kept. If no new root is found, the
+    wire is not CONVERGED, even if it was before.
 
     Args:
         tracker: Tracker at the end of its path.

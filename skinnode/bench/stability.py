@@ -57,7 +57,7 @@ def run(
         report: Function that receives each row as soon as it is complete.
 
     Returns:
-        The rows, and the number of wrong wires other than known limitations (``Case.known_wrong``).
+        The rows, and the number of wrong wires, excluding known limitations (``Case.known_wrong``).
     """
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:

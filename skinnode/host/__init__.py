@@ -8,7 +8,7 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
         -> patch_stream (assembles scans) -> code_watch (selects usable codes) -> workers, scan_solver
         -> publish (subscriptions, drop_oldest_queue) -> callback, hand_frame
     code_watch: code_runs -> converter_liveness (frozen patches), frozen_parts (frozen wires and crossings),
-        wire_windows and wire_faults (noisy, drifting, open and shorted wires)
+        noisy_and_drifting_wires, open_and_shorted_wires
 
     start (brings up all nodes) -> remote_node -> configurator (configures one node), sdo_client, lss_master
     supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch

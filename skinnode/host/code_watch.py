@@ -7,7 +7,8 @@ Before a scan is solved, :meth:`CodeWatch.judge` compares its codes with the pre
 - which frozen crossings are left out of the solve (:mod:`skinnode.host.frozen_parts`),
 - which wires are open or shorted.
 
-Later, :meth:`CodeWatch.on_scan` searches for noisy and drifting wires (:mod:`skinnode.host.wire_windows`).
+Later, :meth:`CodeWatch.on_scan` searches for noisy and drifting wires
+(:mod:`skinnode.host.noisy_and_drifting_wires`).
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from numpy.typing import NDArray
 from skinnode.host import code_runs
 from skinnode.host.converter_liveness import Alive, ConverterLiveness
 from skinnode.host.frozen_parts import FrozenParts
-from skinnode.host.wire_faults import WireFault, broken_wires
-from skinnode.host.wire_windows import WireWindows
+from skinnode.host.noisy_and_drifting_wires import WireWindows
+from skinnode.host.open_and_shorted_wires import WireFault, broken_wires
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.frames import FieldFrame, sealed
 from skinnode.protocol.codes import MISSING, CodeScale

@@ -11,8 +11,8 @@ scans in which no code changes. A converter counts as stopped if all of these co
 - With the noise stated in the hand file, a running converter would produce such a run with a probability of
   at most ``FALSE_ALARM``.
 - With a lower noise, the probability is at most ``FALSE_ALARM_QUIET``. The lower noise is the stated noise
-  divided by ``QUIETER``, or half of the noise measured by :mod:`skinnode.host.wire_windows` if that is
-  larger.
+  divided by ``QUIETER``, or half of the noise measured by :mod:`skinnode.host.noisy_and_drifting_wires` if
+  that is larger.
 - The codes are known to be noisy: in at least ``FLICKERS`` earlier scans, a code has returned to the value it
   had before its last change.
 - The run is at least ``LONGER`` times as long as any earlier run of the running converter. Runs at rest and

@@ -13,7 +13,7 @@ from typing import Final
 from skinnode.canopen.emergency import register_text
 from skinnode.canopen.nmt import STATE_NAMES, NmtState
 from skinnode.host.converter_liveness import Alive
-from skinnode.host.wire_faults import WireFault
+from skinnode.host.open_and_shorted_wires import WireFault
 from skinnode.model.data_fault import DataFault
 from skinnode.model.frames import FieldFrame
 from skinnode.transport.bus_state import BusState

@@ -44,7 +44,7 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join the threads of the mainline.
+        """Stop the mainline threads and join them.
 
         Frames can still be sent afterwards.
         """

@@ -15,7 +15,7 @@ from skinnode.canopen.emergency import EmcyCode
 from skinnode.diagnose.root_causes import RULES
 from skinnode.host import health_watch
 from skinnode.host.health import BusHealth, Condition, PatchHealth
-from skinnode.host.wire_faults import WireState
+from skinnode.host.open_and_shorted_wires import WireState
 
 from .blocks import DOCS
 

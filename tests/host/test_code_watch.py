@@ -11,7 +11,7 @@ from skinnode.config import SimulationConfig
 from skinnode.host.code_runs import LEAST_RUN
 from skinnode.host.code_watch import CodeWatch, Verdict
 from skinnode.host.converter_liveness import Alive
-from skinnode.host.wire_faults import WireFault, WireState
+from skinnode.host.open_and_shorted_wires import WireFault, WireState
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.codes import MISSING, CodeScale, encode

@@ -15,7 +15,7 @@ from skinnode.host.containment import Defects
 from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.health_watch import HealthWatch
-from skinnode.host.wire_faults import WireFault, WireState
+from skinnode.host.open_and_shorted_wires import WireFault, WireState
 from skinnode.process import clock
 from skinnode.transport.bus_state import BusState
 

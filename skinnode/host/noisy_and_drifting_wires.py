@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.host.wire_faults import WireFault, WireState
+from skinnode.host.open_and_shorted_wires import WireFault, WireState
 from skinnode.protocol.codes import Codes, CodeScale
 from skinnode.protocol.scan import Scan
 

@@ -214,7 +214,7 @@ class ScanAssembler:
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return the earliest time (ns) at which :meth:`poll` will close the open scan; None if no scan is open.
+        """Return the earliest time (ns) at which :meth:`poll` closes the open scan; None if none is open.
 
         Each frame that arrives may change this time.
         """

@@ -280,7 +280,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s² (in pitch²) at which the expected change in R from rest equals the measured change."""
+        """Return the s² (pitch²) at which the expected change in R from rest equals the measured change."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())

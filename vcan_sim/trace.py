@@ -17,7 +17,7 @@ _POLL_S: Final = 0.05
 """Maximum wait for the next frame, s."""
 
 _LAST_FRAMES: Final = 10_000
-"""Maximum number of frames that a listener still reads after it has been told to stop."""
+"""Maximum number of frames that a listener still reads after it has been stopped."""
 
 
 class Trace:

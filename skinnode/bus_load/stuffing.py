@@ -140,7 +140,8 @@ def _classic_one(  # noqa: PLR0913 - arrays of a compiled kernel
     crc: Any = np.int64(crc_of[head >> 16])
     crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head >> 8 & 0xFF)])
     crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
-    # as in _classic, each byte to be stuffed is assembled from two adjacent payload bytes
+    # The 19-bit head, the 15-bit CRC and six filler bits make up five bytes. Because the head ends inside a
+    # byte, each byte to be stuffed is assembled from two adjacent payload bytes.
     stream = (ALTERNATING & 0x3F) << 18 | head >> 1
     stuff: Any = 0
     run: Any = 0
@@ -167,30 +168,11 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
     total, begin = 0, 0
     for i in range(ids.size):
         length: Any = np.int64(lengths[i])
-        head: Any = np.int64(ids[i] & 0x7FF) << 7 | length
-        crc: Any = np.int64(crc_of[head >> 16])
-        crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head >> 8 & 0xFF)])
-        crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
+        high: Any = 0
+        low: Any = 0
         for k in range(begin, begin + length):
-            crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # The 19-bit head, the 15-bit CRC and six filler bits make up five bytes. Because the head ends inside
-        # a byte, each byte to be stuffed is assembled from two adjacent payload bytes.
-        stream = (ALTERNATING & 0x3F) << 18 | head >> 1
-        stuff: Any = 0
-        run: Any = 0
-        before = head
-        for shift in (16, 8, 0):
-            entry = np.int64(run_of[run << 8 | (stream >> shift & 0xFF)])
-            stuff, run = stuff + (entry & 0xFF), entry >> 8
-        for k in range(begin, begin + length):
-            byte = np.int64(payload[k])
-            entry = np.int64(run_of[run << 8 | (before & 1) << 7 | byte >> 1])
-            stuff, run, before = stuff + (entry & 0xFF), entry >> 8, byte
-        last = (before & 1) << 15 | crc
-        for shift in (8, 0):
-            entry = np.int64(run_of[run << 8 | (last >> shift & 0xFF)])
-            stuff, run = stuff + (entry & 0xFF), entry >> 8
-        bits[i] = HEAD_BITS + 8 * length + CRC_BITS + TAIL_BITS + stuff
+            high, low = (high << 8 | low >> 24) & 0xFFFF_FFFF, (low << 8 | np.int64(payload[k])) & 0xFFFF_FFFF
+        bits[i] = _classic_one(np.int64(ids[i] & 0x7FF) << 7 | length, length, high, low, crc_of, run_of)
         total += bits[i]
         begin += stride if stride else length
     return total

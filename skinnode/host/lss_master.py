@@ -1,8 +1,8 @@
 """Find nodes without a node-ID, and set node-IDs and bit rates, as an LSS master (CiA 305 v3.0).
 
 A slave that does not match a request stays silent, so every negative result costs a full timeout. LSS
-responses are not numbered, so a late response to an earlier request cannot be told from a response to the
-current one. The master therefore counts a node as found or selected only when the node has returned its own
+responses are not numbered, so a late response to an earlier request looks like a response to the current
+one. The master therefore counts a node as found or selected only when the node has returned its own
 LSS address. After a timeout, the master waits until a late response can no longer arrive.
 """
 

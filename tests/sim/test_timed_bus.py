@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.errors import ConfigError
-from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, StationOptions, TimedBus
+from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, NthFrame, StationOptions, TimedBus
 
 from .naive_can import draw, head
 
@@ -233,6 +233,44 @@ def test_every_frame_is_delivered_once_and_steps_of_time_do_not_matter(
     for event in events:
         assert event.time_ns - event.started_ns == (bits(event.frame) - 3) * 1000
         assert event.queued_ns < event.started_ns + 1000
+
+
+CHANGES = st.tuples(
+    st.integers(0, 3_000_000), st.integers(0, 2), st.sampled_from(["clear", "disconnect", "connect"])
+)
+
+
+@settings(deadline=None, max_examples=300)
+@given(traffic(), st.lists(CHANGES, max_size=8))
+def test_bursts_are_what_single_frames_are(
+    sent: list[tuple[int, int, CanFrame]], changes: list[tuple[int, int, str]]
+) -> None:
+    """A rule, even one that hits no frame, makes the bus decide on each frame by itself."""
+    never = NthFrame(0x7FF, 1)
+    in_bursts, one_by_one = bus_of(3), TimedBus([StationOptions()] * 3, None, [never])
+    calls = [(time_ns, station, name, ()) for time_ns, station, name in changes]
+    calls += [(time_ns, station, "send", (frame,)) for time_ns, station, frame in sent]
+    for bus in (in_bursts, one_by_one):
+        for time_ns, station, name, arguments in sorted(calls, key=lambda call: call[0]):
+            getattr(bus, name)(time_ns, station, *arguments)
+        for station in range(3):
+            bus.connect(4_000_000 + 400_000 * 25, station)
+    end_ns = 10**9
+    assert in_bursts.advance(end_ns) == one_by_one.advance(end_ns)
+    assert in_bursts.frames == one_by_one.frames
+    assert in_bursts.busy_share(0, end_ns) == one_by_one.busy_share(0, end_ns)
+    for station in range(3):
+        assert in_bursts.counters(station) == one_by_one.counters(station)
+        assert in_bursts.waiting(station) == one_by_one.waiting(station) == 0
+
+
+def test_a_frame_within_a_bit_of_the_start_interrupts_a_burst() -> None:
+    bus = bus_of(3)
+    for number in range(3):
+        bus.send(0, 0, CanFrame(0x200, bytes([number])))
+    ends_ns = bits(CanFrame(0x200, b"\0")) * 1000  # with the intermission: here the second frame starts
+    bus.send(ends_ns + 500, 1, CanFrame(0x100))
+    assert [event.frame.can_id for event in delivered(bus)] == [0x200, 0x100, 0x200, 0x200]
 
 
 @settings(deadline=None, max_examples=100)

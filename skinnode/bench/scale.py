@@ -203,7 +203,7 @@ def _solved(host: Host) -> int:
 
 
 def _cpu_ns(segments: Sequence[Segment]) -> Counter[str]:
-    """Return the total CPU time of the nodes, the buses and the host so far, ns."""
+    """Return the CPU time in ns that the nodes, the buses and the host have used so far."""
     by_bus: Counter[str] = Counter()
     for each in segments:
         by_bus.update(each.cpu_ns or {})

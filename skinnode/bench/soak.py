@@ -3,9 +3,9 @@
 The host and the simulated nodes run in one process and communicate over two virtual buses. Each round injects
 one to three kinds of fault, such as dropped frames, into one or all patches, while subscribers join and
 leave. In some rounds, child processes also keep all processors busy. At the end of a round, the faults are
-removed. The next round starts when every patch is operational and publishes fields again. Memory use is
-measured twice while no fault is injected, after a warm-up and at the end: the resident memory and the
-number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number of blocks reveals even a
+removed. The next round starts when every patch is operational and publishes fields again. The resident
+memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`) are each measured twice
+while no fault is injected: after a warm-up and at the end. The number of blocks reveals even a
 leak of one object per scan. This module imports the simulator to inject the faults.
 """
 

@@ -224,7 +224,10 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Return a saved value; if it is the default COB-ID for ``node_id``, the default for this node."""
+        """Return a saved value.
+
+        If the value is the default COB-ID of node ``node_id``, return this node's default COB-ID instead.
+        """
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

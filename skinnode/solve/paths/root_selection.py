@@ -89,7 +89,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each rough root for which :func:`guide` finds another root or none; do not move the wires."""
+    """Reject each rough root unless :func:`guide` ends at the same root. The wires are not moved."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()

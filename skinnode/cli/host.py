@@ -36,13 +36,14 @@ def host(
     lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
     be run, or if a node sent frames whose content does not match their identifier.
     """
+    from skinnode.config import load_hand
+
+    plan = load_hand(hand).on(interface, channel)  # before the imports that take a second
     from skinnode.cli._host_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold
-    from skinnode.config import load_hand
     from skinnode.host.scan_solver import check_solvable
     from skinnode.process.signals import stop_on_signal
 
-    plan = load_hand(hand).on(interface, channel)
     report = JsonReport() if as_json else TextReport()
     if is_cold():
         report.note("compiling the kernels once; this takes a few seconds")

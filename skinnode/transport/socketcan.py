@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
+from skinnode.transport.hardware_time import OLDEST_NS, HardwareClock
 from skinnode.transport.recvmmsg import MessageBatch
 
 if TYPE_CHECKING:
@@ -41,10 +42,6 @@ timestamps."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
-_OLDEST_NS: Final = 10_000_000_000
-"""Maximum plausible age of a frame, ns. If the wall clock was set after a frame had arrived, the frame seems
-older, and its timestamp is replaced by the time at which it is read."""
-
 _NEWEST_NS: Final = 100_000_000
 """Maximum plausible time (ns) by which a timestamp is later than the reading of its frame."""
 
@@ -58,7 +55,7 @@ BATCH_FRAMES: Final = 256
 class SocketReader:
     """Receives batches of frames from a bound SocketCAN socket. Only one thread may use it.
 
-    Arrival times are based on hardware timestamps if the driver provides them (:class:`HardwareDelay`).
+    Arrival times are based on hardware timestamps if the driver provides them (:class:`HardwareClock`).
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -70,7 +67,7 @@ class SocketReader:
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
         """Whether the last frame had a hardware timestamp."""
-        self._delay = HardwareDelay()
+        self._hardware = HardwareClock()
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0
         )  # python-can enables these timestamps, but a socket supports only one kind
@@ -102,7 +99,7 @@ class SocketReader:
             return []
         now_ns = time.monotonic_ns()
         wall_to_mono_ns = now_ns - time.time_ns()
-        earliest_ns, latest_ns = now_ns - _OLDEST_NS, now_ns + _NEWEST_NS
+        earliest_ns, latest_ns = now_ns - OLDEST_NS, now_ns + _NEWEST_NS
         second = second_ns = 0
         frames: list[Frame] = []
         new = tuple.__new__  # half the time of Frame.__new__
@@ -137,11 +134,11 @@ class SocketReader:
                 seconds, nanoseconds, _, _, hardware_s, hardware_ns = stamps
                 if seconds:
                     t_ns = seconds * 1_000_000_000 + nanoseconds + wall_to_mono_ns
-                    if not -_NEWEST_NS < now_ns - t_ns < _OLDEST_NS:
+                    if not -_NEWEST_NS < now_ns - t_ns < OLDEST_NS:
                         t_ns = now_ns
                 self.hardware_stamps = hardware_s != 0
                 if hardware_s:
-                    t_ns = self._delay.arrival_ns(hardware_s * 1_000_000_000 + hardware_ns, t_ns)
+                    t_ns = self._hardware.arrival_ns(hardware_s * 1_000_000_000 + hardware_ns, t_ns)
             elif kind == _SO_RXQ_OVFL:
                 (self.dropped,) = _DROPS.unpack_from(control, at + _CONTROL.size)
             at += -(-length // _ALIGNED) * _ALIGNED
@@ -174,32 +171,3 @@ def set_link_bitrate(config: BusConfig) -> None:
 def _ip_link(config: BusConfig, *arguments: str) -> None:
     command = ["ip", "link", "set", config.channel, *arguments]
     subprocess.run(command, check=True, capture_output=True, text=True, timeout=_IP_S)
-
-
-class HardwareDelay:
-    """Converts hardware timestamps of a CAN controller to the monotonic clock. Only one thread may use it.
-
-    The kernel may timestamp a frame late, but never early. The difference between the kernel timestamp and
-    the hardware timestamp of a frame is therefore an upper bound on the offset between the two clocks. The
-    estimated offset follows the lowest bounds, and rises no faster than two clocks can drift apart.
-    """
-
-    DRIFT: Final = 200e-6  # two oscillators with a tolerance of 100 ppm each
-
-    def __init__(self) -> None:
-        self._offset_ns: int | None = None
-        self._last_ns = 0
-
-    def arrival_ns(self, hardware_ns: int, kernel_ns: int) -> int:
-        """Return the arrival time of a frame on the monotonic clock, ns.
-
-        Args:
-            hardware_ns: Hardware timestamp, ns.
-            kernel_ns: Kernel timestamp, converted to the monotonic clock, ns.
-        """
-        offset_ns = kernel_ns - hardware_ns
-        if self._offset_ns is not None and abs(offset_ns - self._offset_ns) < _OLDEST_NS:
-            risen_ns = self._offset_ns + int(self.DRIFT * max(0, hardware_ns - self._last_ns))
-            offset_ns = min(offset_ns, risen_ns)
-        self._offset_ns, self._last_ns = offset_ns, hardware_ns
-        return hardware_ns + offset_ns

@@ -12,7 +12,7 @@ import pytest
 from skinnode.config import BusConfig
 from skinnode.errors import BusError
 from skinnode.transport import CanPort, Frame
-from skinnode.transport.socketcan import HardwareDelay
+from skinnode.transport.hardware_time import HardwareClock
 
 VCAN = BusConfig(name="can7", interface="socketcan", channel="vcan0")
 MS = 1_000_000
@@ -82,7 +82,7 @@ def test_a_link_without_a_bit_rate_says_so_and_is_up_again() -> None:
 def test_hardware_stamps_keep_a_frames_time_however_late_the_kernel_was() -> None:
     """A controller whose clock is 100 s off and 50 ppm fast, frames every 10 ms, the kernel 0 to 5 ms late:
     but for the first frames, times are right to what the clock drifts between two prompt ones."""
-    delay = HardwareDelay()
+    delay = HardwareClock()
     late_ns = [(7 * i) % 26 * MS // 5 for i in range(1000)]
     errors_ns = []
     for i, late in enumerate(late_ns):
@@ -95,7 +95,7 @@ def test_hardware_stamps_keep_a_frames_time_however_late_the_kernel_was() -> Non
 
 
 def test_a_controller_whose_clock_starts_anew_is_followed() -> None:
-    delay = HardwareDelay()
+    delay = HardwareClock()
     assert delay.arrival_ns(60_000 * MS, 1_000 * MS) == 1_000 * MS
     assert delay.arrival_ns(0, 1_010 * MS) == 1_010 * MS
     assert delay.arrival_ns(5 * MS, 1_016 * MS) == pytest.approx(1_015 * MS, abs=2_000)

@@ -67,6 +67,8 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     same file in another terminal. To change the faults while the simulator is running, use `vcan-sim inject`.
     """
     from skinnode.config import load_hand
+
+    plan = load_hand(hand).on(interface, channel)  # before the imports that take a second
     from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
     from vcan_sim.fleet import Fleet
@@ -74,7 +76,6 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     from vcan_sim.scenes.library import scene_file
     from vcan_sim.skin.imperfections import Imperfections
 
-    plan = load_hand(hand).on(interface, channel)
     scene = None if scene is None else scene_file(scene)
     if plot is not None:
         _preview(plan, scene, plot)

@@ -18,7 +18,7 @@ import math
 from typing import Final
 
 import numpy as np
-from scipy.special import j0, j1
+import scipy
 
 from skinnode.model.elastic import Rubber
 from skinnode.model.layout import Float
@@ -63,7 +63,7 @@ def bonded_layer_compliance(
     nodes, weights = np.polynomial.legendre.leggauss(8)
     panels = math.ceil(count / len(nodes))
     k = (0.5 * end / panels) * (nodes + 2.0 * np.arange(panels)[:, None] + 1.0).reshape(-1)
-    disc = 2.0 * j1(k * radius_m) / (k * radius_m) * np.exp(-0.5 * (BLUR * k * radius_m) ** 2)
+    disc = 2.0 * scipy.special.j1(k * radius_m) / (k * radius_m) * np.exp(-0.5 * (BLUR * k * radius_m) ** 2)
     weight = np.tile(weights, panels) * (0.5 * end / panels) * disc
     x = np.minimum(k * thickness_m, 300.0)
     below = 2.0 * rubber.shear_modulus_pa * (np.cosh(2.0 * x) + 1.0 + 2.0 * x**2)
@@ -73,6 +73,6 @@ def bonded_layer_compliance(
     of_normal, of_outwards = np.empty((2, different.size))
     for first in range(0, different.size, 256):
         waves = np.outer(different[first : first + 256], k)
-        of_normal[first : first + 256] = j0(waves) @ normal
-        of_outwards[first : first + 256] = j1(waves) @ outwards
+        of_normal[first : first + 256] = scipy.special.j0(waves) @ normal
+        of_outwards[first : first + 256] = scipy.special.j1(waves) @ outwards
     return of_normal[where].reshape(distance.shape), of_outwards[where].reshape(distance.shape)

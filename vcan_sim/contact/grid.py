@@ -10,7 +10,7 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
+import scipy
 
 from vcan_sim.contact.layer import Float, Layer, cell_response
 
@@ -41,12 +41,15 @@ class Grid:
             shape: Numbers of cells along x and y.
             size_m: Side length of a cell, metres.
         """
-        padded = (fft.next_fast_len(2 * shape[0], real=True), fft.next_fast_len(2 * shape[1], real=True))
+        padded = (
+            scipy.fft.next_fast_len(2 * shape[0], real=True),
+            scipy.fft.next_fast_len(2 * shape[1], real=True),
+        )
         steps = [(np.arange(n) + m - 1) % n - (m - 1) for n, m in zip(padded, shape, strict=True)]
         offset = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1) * size_m
         response = cell_response(layer, offset, size_m, float(np.hypot(*np.abs(offset).max(axis=(0, 1)))))
         turned = np.ascontiguousarray(np.moveaxis(response, (2, 3), (0, 1)))
-        return cls(layer, shape, size_m, padded, fft.rfft2(turned))
+        return cls(layer, shape, size_m, padded, scipy.fft.rfft2(turned))
 
     def centres_m(self, origin_m: Float) -> Float:
         """Return the cell centres (X, Y, 2) in metres, of which the first is ``origin_m`` (2,)."""
@@ -55,19 +58,19 @@ class Grid:
 
     def displacement_m(self, traction_pa: Float) -> Float:
         """Return the displacement (3, X, Y) in metres due to tractions (3, X, Y) in Pa."""
-        waves = fft.rfft2(traction_pa, self._padded)
-        moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
+        waves = scipy.fft.rfft2(traction_pa, self._padded)
+        moved = scipy.fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     def normal_m(self, pressure_pa: Float) -> Float:
         """Return the indentation (X, Y) in metres due to a pressure (X, Y) in Pa."""
-        waves = self._response[2, 2] * fft.rfft2(pressure_pa, self._padded)
-        return np.asarray(fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
+        waves = self._response[2, 2] * scipy.fft.rfft2(pressure_pa, self._padded)
+        return np.asarray(scipy.fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
 
     def shear_m(self, traction_pa: Float) -> Float:
         """Return the tangential displacement (2, X, Y) in metres due to shear tractions (2, X, Y) in Pa."""
-        waves = fft.rfft2(traction_pa, self._padded)
-        moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
+        waves = scipy.fft.rfft2(traction_pa, self._padded)
+        moved = scipy.fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     @functools.cached_property

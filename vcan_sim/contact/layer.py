@@ -21,9 +21,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.special import j0, j1
 
 Float = NDArray[np.float64]
 
@@ -119,13 +118,13 @@ class PointResponse:
         tables = np.empty((4, len(r)))
         for start in range(0, len(r), 64):  # in blocks, to limit memory use
             waves = np.outer(r[start : start + 64], k)
-            zeroth, first = j0(waves), j1(waves)
+            zeroth, first = scipy.special.j0(waves), scipy.special.j1(waves)
             second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)
             tables[0, start : start + 64] = zeroth @ normal / (2.0 * math.pi)
             tables[1, start : start + 64] = zeroth @ (along + across) / (4.0 * math.pi)
             tables[2, start : start + 64] = second @ (across - along) / (4.0 * math.pi)
             tables[3, start : start + 64] = first @ crossed / (2.0 * math.pi)
-        self._splines = tuple(CubicSpline(r, table) for table in tables)
+        self._splines = tuple(scipy.interpolate.CubicSpline(r, table) for table in tables)
 
     def __call__(self, distance_m: Float) -> tuple[Float, Float, Float, Float]:
         """Return the coefficients Z, A, B and K (m/N) of the displacement due to a point force f.

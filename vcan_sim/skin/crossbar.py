@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solveh_banded
+import scipy
 
 from skinnode.model.layout import Float
 
@@ -148,7 +148,7 @@ def _tridiagonal(diagonals: tuple[Float, Float], right: Float) -> Float:
     diagonal, beside = diagonals
     if not beside.any():
         return np.asarray(right / diagonal[:, None])
-    return np.asarray(solveh_banded(np.stack([beside, diagonal]), right, check_finite=False))
+    return np.asarray(scipy.linalg.solveh_banded(np.stack([beside, diagonal]), right, check_finite=False))
 
 
 def _dense(diagonals: tuple[Float, Float]) -> Float:

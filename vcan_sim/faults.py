@@ -13,6 +13,7 @@ from skinnode.errors import ConfigError
 from vcan_sim.tally import Kind
 
 OF_CHUNKS: Final = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted", "corrupted")
+OF_READINGS: Final = ("flipped",)
 OF_SCANS: Final = ("torn", "summary_lost", "reset", "displaced", "understated", "unchecked")
 LOST_OUT: Final = {
     Kind.SDO_RESPONSE: "sdo_response_lost",
@@ -35,7 +36,7 @@ _SHARES: Final = (
     *OF_SCANS,
     "sync_lost",
     "long",
-    "flipped",
+    *OF_READINGS,
     *dict.fromkeys((*LOST_OUT.values(), *LOST_IN.values())),
 )
 OF_WIRES: Final = (

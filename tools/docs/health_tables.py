@@ -11,7 +11,7 @@ import markdown_text as md
 
 from skinnode.host.health import Condition
 from vcan_sim.bus_attacker import BusFaults
-from vcan_sim.faults import OF_CHUNKS, OF_SCANS, OF_WIRES, Faults
+from vcan_sim.faults import OF_CHUNKS, OF_READINGS, OF_SCANS, OF_WIRES, Faults
 from vcan_sim.skin.imperfections import Imperfections
 
 _PLAIN: Final = {
@@ -39,7 +39,7 @@ def faults() -> str:
         value = kinds.get(str(kind), "fraction of the frames")
         if name in (*OF_CHUNKS, *OF_SCANS):
             value = "fraction of the chunks" if name in OF_CHUNKS else "fraction of the scans"
-        elif name == "flipped":
+        elif name in OF_READINGS:
             value = "fraction of the readings"
         elif name in OF_WIRES:
             value = "number of a wire"

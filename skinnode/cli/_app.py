@@ -25,8 +25,9 @@ from skinnode.cli import (
     scan,
     tare,
 )
+from skinnode.cli._help import App
 
-app = typer.Typer(
+app = App(
     name="skinnode",
     help="Run robot skin on a CAN bus: measure how skin patches deform when they are pressed.",
     no_args_is_help=True,

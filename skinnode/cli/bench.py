@@ -10,11 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
+from skinnode.cli._help import App
 from skinnode.errors import ConfigError
 
-app = typer.Typer(
-    help="Measure the performance of solver, node and host on this machine.", no_args_is_help=True
-)
+app = App(help="Measure the performance of solver, node and host on this machine.", no_args_is_help=True)
 
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the results to FILE.")

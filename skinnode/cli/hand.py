@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skinnode.cli._help import App
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from skinnode.config import HandConfig
     from skinnode.host.limitations import Limitation
 
-app = typer.Typer(
+app = App(
     help="Check or create a hand file, compute its bus load, or print the JSON Schema.", no_args_is_help=True
 )
 

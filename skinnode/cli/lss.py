@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skinnode.cli._help import App
 from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, node_ids
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from skinnode.cli._bus import Place
     from skinnode.diagnose.lss_commissioning import Commissioned
 
-app = typer.Typer(help="Layer setting services: set the node-ID and bit rate of nodes.", no_args_is_help=True)
+app = App(help="Layer setting services: set the node-ID and bit rate of nodes.", no_args_is_help=True)
 
 
 @app.command(name="list")

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
+import typer.testing
 
 from skinnode import cli
+from skinnode.cli.main import app as skinnode_app
+from vcan_sim.cli import app as simulator_app
 
 SKINNODE = Path(sys.executable).with_name("skinnode")
 
@@ -38,6 +46,29 @@ def test_help_and_page_name_the_command(command: str) -> None:
     assert done.returncode == 0
     assert "Usage" in done.stdout
     assert done.stderr == ""
+
+
+def leaves(command: Any) -> Iterator[Any]:
+    for inner in getattr(command, "commands", {}).values():
+        yield from leaves(inner)
+    if not hasattr(command, "commands"):
+        yield command
+
+
+LEAVES = [leaf for app in (skinnode_app, simulator_app) for leaf in leaves(typer.main.get_command(app))]
+
+
+@pytest.mark.parametrize("leaf", LEAVES, ids=lambda leaf: leaf.callback.__name__)
+def test_help_breaks_lines_only_where_the_terminal_ends(
+    leaf: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Paragraphs of a docstring are one line on a wide terminal; an option without a value shows no type."""
+    monkeypatch.setenv("COLUMNS", "2000")
+    leaf.main(["--help"], standalone_mode=False)
+    shown = capsys.readouterr().out
+    assert "<bool>" not in shown
+    for paragraph in re.split(r"\n\s*\n", inspect.getdoc(leaf.callback) or ""):
+        assert " ".join(paragraph.split()) in shown
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import typer
-from typer.core import TyperGroup
-
+from skinnode.cli._help import App, Group
 from vcan_sim.commands import inject, list_scenes, replay, run
 
 DEFAULT: Final = "run"
@@ -14,7 +12,7 @@ DEFAULT: Final = "run"
 _OF_GROUP: Final = ("-h", "--help", "--install-completion", "--show-completion")
 
 
-class _Group(TyperGroup):
+class _Group(Group):
     """Command group in which the name of the default command may be omitted."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -34,7 +32,7 @@ class _Group(TyperGroup):
         return own + [item for item in of_default if item.value not in known]
 
 
-app = typer.Typer(
+app = App(
     name="vcan-sim",
     cls=_Group,
     help="Simulate patches of robot skin as CANopen nodes. The default command is run.",

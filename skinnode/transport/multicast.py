@@ -1,9 +1,9 @@
 """Frames in UDP multicast packets, exchanged with python-can's interface udp_multicast.
 
 python-can opens and configures the socket, and defines the format of the packets: a msgpack map with one
-entry per attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgpack would take longer
-than sending it. In the packets of a program, however, everything but the timestamp and the data recurs, so
-each kind of frame is converted by python-can only once:
+entry per attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgpack would take
+longer than sending it. In the packets of a program, however, everything but the timestamp and the data
+recurs, so python-can converts each kind of frame only once:
 
 - To send a frame, its data is inserted into a packet that python-can has packed for this identifier and
   length.
@@ -11,7 +11,8 @@ each kind of frame is converted by python-can only once:
   unpacked. Packets that differ from all of these, or that have another layout, are unpacked by python-can.
 
 Packets are received in batches, with kernel timestamps and the kernel's drop counter. A sender also receives
-its own packets. They contain the tag of the endpoint, and are skipped.
+its own packets. They contain a tag in the channel field, which python-can transmits but does not use, and are
+skipped.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import select
 import socket
 import struct
 import time
+import uuid
 from typing import Final, NamedTuple
 
 import can
@@ -31,6 +33,7 @@ from skinnode.process import clock
 from skinnode.transport.frame import Frame
 from skinnode.transport.hardware_time import OLDEST_NS
 from skinnode.transport.recvmmsg import MessageBatch
+from skinnode.transport.sendto import PacketSender
 from skinnode.transport.socket_options import SO_RXQ_OVFL
 
 # From <linux/in.h> and <linux/in6.h>; Python does not define these constants.
@@ -49,16 +52,29 @@ _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
 _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMP.size)
 _COUNTED_BYTES: Final = _STAMPED_BYTES + socket.CMSG_SPACE(_DROPS.size)
-_RECORD: Final = struct.Struct(
-    f"@{_PACKET_BYTES}x{_CONTROL.size}xqq{_CONTROL.size}xI{_COUNTED_BYTES - _STAMPED_BYTES - _CONTROL.size - 4}x"
-)
-"""Layout of a received message in memory: packet, timestamp, drop counter. The kernel adds the drop counter
-after the timestamp, as soon as it has dropped a packet."""
-
 _HEAD: Final = b"\x8b\xa9timestamp\xcb"  # a map of 11 entries, the first of which is a 64-bit float
 _HEAD_BYTES: Final = len(_HEAD) + 8
 """Length of a packet's head, up to the end of the timestamp, bytes."""
 _DATA: Final = b"\xa4data\xc4"  # key of the data, and type of byte strings; followed by the length (u8)
+
+
+def new_tag() -> str:
+    """Return a tag for the channel field of one endpoint's packets."""
+    return f"skinnode-{uuid.uuid4().hex}"
+
+
+_TAG_BYTES: Final = len(new_tag())
+_TAG_AT: Final = pack_message(
+    can.Message(arbitration_id=0x7FF, is_extended_id=False, channel=new_tag())
+).index(b"skinnode-")
+"""Position of the tag in packets of this program with identifiers from 0x100, bytes."""
+_TAG_END: Final = _TAG_AT + _TAG_BYTES
+
+_RECORD: Final = struct.Struct(
+    f"@{_TAG_AT}x{_TAG_BYTES}s{_PACKET_BYTES - _TAG_END}x{_CONTROL.size}xqq{_CONTROL.size}xI4x"
+)
+"""Layout of a received message in memory: packet with tag, timestamp, drop counter. The kernel adds the drop
+counter after the timestamp, as soon as it has dropped a packet."""
 
 _MOST_KINDS: Final = 4096
 """Maximum number of kinds of packets to remember. Sixteen patches send 100 kinds."""
@@ -83,15 +99,14 @@ class MulticastSocket:
     Args:
         bus: Open python-can bus, whose socket the endpoint takes over. The bus is shut down.
         group: Address of the multicast group.
-        tag: Text in the channel field of all packets from this endpoint, which python-can transmits but does
-            not use.
+        tag: Result of :func:`new_tag`.
     """
 
     def __init__(self, bus: can.BusABC, group: str, tag: str) -> None:
         self._sock = socket.socket(fileno=os.dup(bus.fileno()))
         bus.shutdown()
         self._filters = bus
-        self._group = (group, self._sock.getsockname()[1])
+        self._sender = PacketSender(self._sock, group, self._sock.getsockname()[1])
         self._tag = tag
         self._packed: dict[tuple[int, int, bool, bool], tuple[bytes, bytes]] = {}
         self._kinds: dict[bytes, _Kind | None] = {}
@@ -125,7 +140,7 @@ class MulticastSocket:
         packed = self._packed.get(kind)
         if packed is None:
             packed = self._packed[kind] = self._pack(can_id, len(data), remote, fd)
-        self._sock.sendto(packed[0] + data + packed[1], self._group)
+        self._sender.send(packed[0] + data + packed[1])
 
     def _pack(self, can_id: int, n_bytes: int, remote: bool, fd: bool) -> tuple[bytes, bytes]:
         """Return the parts of a packet before and after the data."""
@@ -174,7 +189,7 @@ class MulticastSocket:
             timeout_s = end_s - time.monotonic()
 
     def _fetch(self) -> bool:
-        """Fetch packets until there are wanted frames, or no more packets. Return whether there are frames."""
+        """Fetch packets until there are frames or no more packets. Return whether there are frames."""
         while count := self._batch.receive(self._sock, _BATCH_PACKETS):
             self._waiting = self._unpack_batch()
             if self._waiting:
@@ -185,16 +200,18 @@ class MulticastSocket:
 
     def _unpack_batch(self) -> list[Frame]:
         """Return the frames of other endpoints in the batch."""
-        batch, unpack = self._batch, self._unpack
+        batch, unpack, own = self._batch, self._unpack, self._tag.encode()
         now_ns = time.monotonic_ns()
         wall_to_mono_ns = now_ns - time.time_ns()
         earliest_ns, latest_ns = now_ns - OLDEST_NS, now_ns + _NEWEST_NS
         frames: list[Frame] = []
         new = tuple.__new__  # half the time of Frame.__new__
         records = zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True)
-        for number, ((control, length), (seconds, nanoseconds, drops)) in enumerate(records):
+        for number, ((control, length), (tag, seconds, nanoseconds, drops)) in enumerate(records):
             if control == _COUNTED_BYTES:
                 self.dropped = drops
+            if tag == own and length >= _TAG_END:  # a third of the time of unpack()
+                continue
             kind, data = unpack(batch.payload(number, length))
             if kind is None:
                 continue

@@ -11,7 +11,6 @@ import difflib
 import errno
 import logging
 import threading
-import uuid
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -23,7 +22,7 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_interface import FrameInterface
-from skinnode.transport.multicast import MulticastSocket, limit_to_group
+from skinnode.transport.multicast import MulticastSocket, limit_to_group, new_tag
 from skinnode.transport.socket_options import enlarge_receive_buffer, socket_of
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
 
@@ -152,7 +151,7 @@ class CanPort:
         self._dropped_before = self._malformed_before = 0  # counters of sockets closed by reopen()
         self._away = False
         # The same tag after reopen(), because the kernel may deliver a frame late.
-        self._tag = f"skinnode-{uuid.uuid4().hex}"
+        self._tag = new_tag()
         self._connect()
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
 

@@ -105,7 +105,6 @@ class MulticastSocket:
     def __init__(self, bus: can.BusABC, group: str, tag: str) -> None:
         self._sock = socket.socket(fileno=os.dup(bus.fileno()))
         bus.shutdown()
-        self._filters = bus
         self._sender = PacketSender(self._sock, group, self._sock.getsockname()[1])
         self._tag = tag
         self._packed: dict[tuple[int, int, bool, bool], tuple[bytes, bytes]] = {}
@@ -244,7 +243,7 @@ class MulticastSocket:
         return kind, bytes(message.data)
 
     def _kind(self, message: can.Message) -> _Kind | None:
-        if message.channel == self._tag or not self._filters._matches_filters(message):
+        if message.channel == self._tag:
             return None
         return _Kind(
             message.arbitration_id,

@@ -259,7 +259,6 @@ def limit_to_group(sock: socket.socket) -> None:
 
     python-can binds the socket to all addresses. Such a socket receives the packets of every multicast group
     that any program on this machine has joined, unless this is disabled.
-
     """
     if sock.family == socket.AF_INET:
         sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)

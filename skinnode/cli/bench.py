@@ -238,15 +238,29 @@ def scale(
         typer.Option(min=1, max=1000, help="Number of patches; one patch is touched. Can be repeated."),
     ] = None,
     scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
+    real_time: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=3600.0,
+            help="Duration of each measurement in real time on udp_multicast, s; 0 to leave them out.",
+            metavar="S",
+        ),
+    ] = 10.0,
 ) -> None:
     """Measure how the CPU time of simulator and host grows with skin area and touched area.
 
-    Hands run in virtual time. Each patch takes about 20 MB of memory.
+    Hands run in virtual time, except for the measurements on udp_multicast. Each patch takes about 20 MB of
+    memory.
     """
+    from skinnode.bench import real_time as multicast
     from skinnode.bench import scale as bench
 
     _prepare(json, plot)
-    figures = bench.run(patches or bench.PATCHES, scans)
+    measured = multicast.run(real_time) if real_time else {}
+    if measured:
+        _print_real_time(measured)
+    figures = bench.run(patches or bench.PATCHES, scans) | {"real_time": measured}
     _print_machine(figures)
     typer.echo("CPU time per patch and scan, ms")
     typer.echo(
@@ -272,6 +286,23 @@ def scale(
         from skinnode.bench.plots.scale import draw
 
         draw(plot, figures)
+
+
+def _print_real_time(figures: dict[str, Any]) -> None:
+    """Print the measurements of the simulator in real time."""
+    for row in figures["rows"]:
+        scans = row["scans"] + row["skipped"]
+        typer.echo(
+            f"simulator in real time on udp_multicast, hop_limit {row['hop_limit']}: "
+            f"{row['patches']} patches, {row['touched']} touched, {row['frames_per_s']:.0f} frames/s: "
+            f"{row['simulator']:.2f} of a core, {row['skipped']} of {scans} scans skipped; "
+            f"host {row['host']:.2f} of a core, {row['fields']} fields; load of the machine {row['load']:.1f}"
+        )
+    times = figures["frame_us"]
+    typer.echo(
+        f"time to send a frame and to receive it at both endpoints: {times['python_can']:.1f} µs with "
+        f"python-can, {times['port']:.1f} µs with CanPort"
+    )
 
 
 @app.command()

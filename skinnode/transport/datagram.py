@@ -12,7 +12,8 @@ from typing import Any, Final
 import can
 
 from skinnode.errors import BusError
-from skinnode.transport.port import RECEIVE_BUFFER_BYTES, SO_RCVBUFFORCE, CanPort
+from skinnode.transport.port import CanPort
+from skinnode.transport.socket_options import enlarge_receive_buffer
 from skinnode.transport.socketcan import HEADER, SocketReader
 
 LOOPBACK: Final = "127.0.0.1"
@@ -57,9 +58,7 @@ class _DatagramBus(can.BusABC):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.bind((LOOPBACK, int(channel)))
-            self.socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
-        except PermissionError:  # only root may exceed net.core.rmem_max
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+            enlarge_receive_buffer(self.socket)
         except BaseException:
             self.socket.close()
             raise

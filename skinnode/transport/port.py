@@ -7,14 +7,10 @@ wall-clock timestamps, which are converted.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import errno
 import logging
-import os
-import socket
 import threading
-import uuid
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -26,6 +22,8 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_interface import FrameInterface
+from skinnode.transport.multicast import MulticastSocket, limit_to_group, new_tag
+from skinnode.transport.socket_options import enlarge_receive_buffer, socket_of
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
 
 if TYPE_CHECKING:
@@ -34,14 +32,6 @@ if TYPE_CHECKING:
 VIRTUAL_QUEUE_FRAMES: Final = 32768
 """Capacity of an endpoint's receive queue on python-can's virtual bus, frames. It holds 4 s of traffic from a
 fully loaded 1 Mbit/s bus."""
-
-RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of it."""
-
-# From <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>; Python does not define these constants.
-SO_RCVBUFFORCE: Final = 33
-_IP_MULTICAST_ALL: Final = 49
-_IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
 """Maximum plausible age of a timestamp, s. An older timestamp, or one in the future, does not come from this
@@ -54,9 +44,6 @@ next send or receive call."""
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
-
-_DELIVERY_S: Final = 0.05
-"""Maximum time (s) that the kernel needs to deliver a frame. The longest time observed was 28 ms."""
 
 # Without a handler, programs that do not configure logging would print python-can's warnings to stderr.
 # BusError already reports the same errors.
@@ -127,7 +114,10 @@ def open_can_bus(config: BusConfig) -> can.BusABC:
             f"{where}: cannot be opened ({_why(error)}), allowed: {_channel_hint(config)}"
         ) from error
     if config.interface in (_MULTICAST, _SOCKETCAN):
-        _tune_socket(bus.fileno())
+        with socket_of(bus.fileno()) as sock:
+            enlarge_receive_buffer(sock)
+            if config.interface == _MULTICAST:
+                limit_to_group(sock)
     return bus
 
 
@@ -157,16 +147,25 @@ class CanPort:
         self._closed = False
         self._link_gone: Exception | None = None
         self._counting = threading.Lock()  # protects the counters of send()
-        self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
-        self._dropped_before = 0  # number of frames dropped by earlier readers
+        self._sent = self._received = self._errors = self._undelivered = 0
+        self._dropped_before = self._malformed_before = 0  # counters of sockets closed by reopen()
         self._away = False
-        self._bus = self._open()
-        self._direct = _direct(self._bus)
-        self._reader = self._open_reader()
-        # A multicast sender also receives its own frames. They are recognised by a unique tag in the channel
-        # field, which python-can transmits but does not use.
-        self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
+        # The same tag after reopen(), because the kernel may deliver a frame late.
+        self._tag = new_tag()
+        self._connect()
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
+
+    def _connect(self) -> None:
+        self._bus = self._open()
+        self._reader = self._open_reader()
+        self._multicast = (
+            MulticastSocket(self._bus, self.config.channel, self._tag)
+            if self.config.interface == _MULTICAST
+            else None
+        )
+        self._socket = self._multicast or self._reader
+        self._direct: FrameInterface | None = self._multicast or _direct(self._bus)
+        self._shutdown = (self._multicast or self._bus).shutdown
 
     def _open(self) -> can.BusABC:
         return open_can_bus(self.config)
@@ -184,11 +183,11 @@ class CanPort:
     @property
     def pollable(self) -> bool:
         """Whether :meth:`fileno` returns a file descriptor that can be polled for frames."""
-        return self._reader is not None
+        return self._socket is not None
 
     def fileno(self) -> int:
         """Return the file descriptor of the socket, or -1 if the port is closed or not pollable."""
-        return -1 if self._reader is None else self._reader.fileno()
+        return -1 if self._socket is None else self._socket.fileno()
 
     @property
     def sent(self) -> int:
@@ -213,12 +212,16 @@ class CanPort:
     @property
     def malformed(self) -> int:
         """Number of multicast packets received that were not CAN frames."""
-        return self._malformed
+        return self._malformed_before + (0 if self._multicast is None else self._multicast.malformed)
 
     @property
     def dropped(self) -> int:
-        """Number of frames dropped because the kernel's receive buffer was full; 0 except on socketcan."""
-        return self._dropped_before + (0 if self._reader is None else self._reader.dropped)
+        """Number of frames dropped because the kernel's receive buffer was full.
+
+        On udp_multicast, the kernel also counts frames of this endpoint and malformed packets. On interfaces
+        other than socketcan and udp_multicast, the number is 0.
+        """
+        return self._dropped_before + (0 if self._socket is None else self._socket.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
@@ -267,7 +270,6 @@ class CanPort:
             is_remote_frame=remote,
             is_fd=fd,
             bitrate_switch=fd,
-            channel=self._tag,
             data=data,
         )
 
@@ -285,7 +287,8 @@ class CanPort:
 
         Args:
             timeout_s: Maximum time to wait for a frame, s.
-            most: Maximum number of frames. Interfaces other than socketcan and timed return one at a time.
+            most: Maximum number of frames. Interfaces other than socketcan, udp_multicast and timed return
+                one at a time.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -308,22 +311,15 @@ class CanPort:
         return frames
 
     def _recv_message(self, timeout_s: float) -> list[Frame]:
-        end_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-        while True:
-            try:
-                message = self._bus.recv(timeout_s)
-                if message is None:
-                    return []
-                if self._tag is None or message.channel != self._tag:
-                    self._received += 1
-                    return [_frame(message)]
-            except (can.CanError, OSError, ValueError) as error:
-                if self._closed or not _is_garbage(error):
-                    self._errors += 1
-                    raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
-                self._malformed += 1
-            # The packet was malformed or sent by this endpoint: wait for another one.
-            timeout_s = max(0.0, (end_ns - clock.monotonic_ns()) * 1e-9)
+        try:
+            message = self._bus.recv(timeout_s)
+        except (can.CanError, OSError, ValueError) as error:
+            self._errors += 1
+            raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
+        if message is None:
+            return []
+        self._received += 1
+        return [_frame(message)]
 
     def reopen(self) -> None:
         """Close and reopen the interface after a failure. The counters keep their values.
@@ -335,12 +331,11 @@ class CanPort:
         """
         if not self._away:
             self._away = True
-            self._dropped_before, self._reader = self.dropped, None
-            self._bus.shutdown()
+            self._dropped_before, self._malformed_before = self.dropped, self.malformed
+            self._reader = self._socket = self._multicast = None
+            self._shutdown()
         self._link_gone = None
-        self._bus = self._open()
-        self._direct = _direct(self._bus)
-        self._reader = self._open_reader()
+        self._connect()
         self._away = False
 
     def set_bitrate(self, bitrate_bps: int) -> None:
@@ -367,7 +362,7 @@ class CanPort:
         """Close the interface. The receiving thread must have ended. Repeated calls have no effect."""
         if not self._closed:
             self._closed = True
-            self._bus.shutdown()
+            self._shutdown()
 
     def __enter__(self) -> Self:
         return self
@@ -385,46 +380,6 @@ def _direct(bus: can.BusABC) -> FrameInterface | None:
     return bus if isinstance(bus, FrameInterface) else None
 
 
-def _tune_socket(fileno: int) -> None:
-    """Enlarge the receive buffer of a socket, and limit reception to its own multicast group."""
-    duplicate = socket.socket(fileno=os.dup(fileno))
-    try:
-        try:
-            duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
-        except OSError:  # only root may exceed net.core.rmem_max
-            duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds the socket to all addresses. Such a socket receives the packets of every multicast
-        # group that any program on this machine has joined, unless this is disabled.
-        if duplicate.family == socket.AF_INET:
-            duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-            _discard_other_groups(duplicate)
-        elif duplicate.family == socket.AF_INET6:
-            duplicate.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
-            _discard_other_groups(duplicate)
-    finally:
-        duplicate.close()
-
-
-def _discard_other_groups(sock: socket.socket) -> None:
-    """Discard packets that were received before reception was limited to one multicast group.
-
-    If there were any, discard once more after a pause, because the kernel may still be delivering packets.
-    """
-    if _discard_waiting(sock):
-        clock.sleep(_DELIVERY_S)
-        _discard_waiting(sock)
-
-
-def _discard_waiting(sock: socket.socket) -> int:
-    """Discard all packets in the receive buffer of a socket, and return their number."""
-    count = 0
-    with contextlib.suppress(BlockingIOError):
-        while True:
-            sock.recv(1, socket.MSG_DONTWAIT)
-            count += 1
-    return count
-
-
 def _frame(message: can.Message) -> Frame:
     now_ns = clock.monotonic_ns()
     age_s = clock.time() - message.timestamp
@@ -439,15 +394,6 @@ def _frame(message: can.Message) -> Frame:
         message.is_extended_id,
         message.is_fd,
     )
-
-
-def _is_garbage(error: Exception) -> bool:
-    """Return whether the content of a multicast packet caused an error.
-
-    Errors of the network are caused by an OSError; errors due to the content of a packet are not.
-    """
-    cause = error.__cause__
-    return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
 
 
 def _why(error: BaseException) -> str:

@@ -205,8 +205,9 @@ class _Shared:
 class Receiver:
     """Receives frames from several ports until :meth:`close` is called.
 
-    All ports that can be polled share one receiving thread. Each other port has its own thread, because
-    receiving with python-can may block. If a port fails, reception from the other ports continues.
+    All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Each other port has
+    its own thread, because receiving with python-can may block. If a port fails, reception from the other
+    ports continues.
 
     Args:
         intakes: Queues to fill, one per port.

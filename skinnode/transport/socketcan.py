@@ -18,11 +18,11 @@ from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
 from skinnode.transport.hardware_time import OLDEST_NS, HardwareClock
 from skinnode.transport.recvmmsg import MessageBatch
+from skinnode.transport.socket_options import SO_RXQ_OVFL
 
 if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
-_SO_RXQ_OVFL: Final = 40
 _SO_TIMESTAMPNS: Final = 35
 _SO_TIMESTAMPING: Final = 37
 _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1 << 6
@@ -74,7 +74,7 @@ class SocketReader:
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPING, _RX_SOFTWARE | _SOFTWARE | _RX_HARDWARE | _RAW_HARDWARE
         )
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
 
     def fileno(self) -> int:
         """Return the file descriptor of the socket, or -1 if it is closed."""
@@ -139,7 +139,7 @@ class SocketReader:
                 self.hardware_stamps = hardware_s != 0
                 if hardware_s:
                     t_ns = self._hardware.arrival_ns(hardware_s * 1_000_000_000 + hardware_ns, t_ns)
-            elif kind == _SO_RXQ_OVFL:
+            elif kind == SO_RXQ_OVFL:
                 (self.dropped,) = _DROPS.unpack_from(control, at + _CONTROL.size)
             at += -(-length // _ALIGNED) * _ALIGNED
         return t_ns

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skinnode.bench import scale
+from skinnode.bench import real_time, scale
 from skinnode.bench.plots.scale import draw
 from skinnode.cli.main import main
 
@@ -25,7 +25,10 @@ def test_the_command_prints_writes_and_plots(
     monkeypatch.setattr(scale, "TOUCHED", (0, 1))
     file, image = tmp_path / "scale.json", tmp_path / "scale.png"
     with pytest.raises(SystemExit) as done:
-        main(f"bench scale --patches 1 --patches 2 --scans 2 --json {file} --plot {image}".split())
+        main(
+            f"bench scale --patches 1 --patches 2 --scans 2 --real-time 0 "
+            f"--json {file} --plot {image}".split()
+        )
     assert done.value.code == 0
     assert "CPU time per patch and scan" in capsys.readouterr().out
     figures = json.loads(file.read_text())
@@ -35,3 +38,18 @@ def test_the_command_prints_writes_and_plots(
     assert figures["changed"][0]["bus_ms"] < 0.7 * figures["contact"][0]["bus_ms"]  # fewer frames
     assert image.read_bytes().startswith(b"\x89PNG")
     draw(image, figures)
+
+
+@pytest.mark.real_time
+def test_in_real_time_all_scans_are_sent_and_solved_in_two_processes() -> None:
+    row = real_time.measure(patches=5, touched=1, hop_limit=0, seconds=1.0)  # on two buses
+    assert row["scans"] + row["skipped"] == pytest.approx(5 * 10 * row["seconds"], abs=10)
+    assert row["fields"] == pytest.approx(row["scans"], abs=10)
+    assert row["frames_per_s"] * row["seconds"] == pytest.approx(101 * row["scans"], rel=0.2)
+    assert row["simulator"] > 0.0
+    assert row["host"] > 0.0
+
+
+def test_the_time_to_exchange_a_frame_is_measured_on_both_roads() -> None:
+    times = real_time.frame_us()
+    assert min(times["python_can"], times["port"]) > 1.0  # a system call alone takes longer

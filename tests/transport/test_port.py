@@ -14,7 +14,7 @@ import pytest
 
 from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.transport import CanPort, Frame
+from skinnode.transport import CanPort, Frame, multicast
 from skinnode.transport import port as port_module
 
 WAIT_S = 5.0
@@ -250,8 +250,8 @@ def test_a_frame_of_another_group_that_is_delivered_late_is_discarded_too(
     with kernel, ours:
         kernel.send(b"accepted before the change")
         delayed = SimpleNamespace(sleep=lambda pause_s: kernel.send(b"delivered after it"))
-        monkeypatch.setattr(port_module, "clock", delayed)
-        port_module._discard_other_groups(ours)
+        monkeypatch.setattr(multicast, "clock", delayed)
+        multicast._discard_other_groups(ours)
         with pytest.raises(BlockingIOError):
             ours.recv(1, socket.MSG_DONTWAIT)
 

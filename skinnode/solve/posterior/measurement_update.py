@@ -57,7 +57,8 @@ class Buffers(NamedTuple):
     """Arrays that a Gauss-Newton step writes, for one patch.
 
     Each of the U wires has K equations and f free coordinates; there are p nuisances. A reduced wire has R =
-    min(K, f + p) rows. With geometry errors, R = K.
+    min(K, f + p) rows. With geometry errors, R = K. The arrays of the factors (``cross_covariance``,
+    ``innovation_covariance`` and ``whitened``) have no elements until :func:`with_factors` provides them.
     """
 
     r: Float
@@ -78,10 +79,6 @@ class Buffers(NamedTuple):
     """(U R, U R) innovation covariance S; the factorisation overwrites it with the Cholesky factor L."""
     whitened: Float
     """(U R, U f) whitened cross-covariance V = L⁻¹ (s² J C)."""
-    kalman_gain_t: Float
-    """(U R, U f) transposed Kalman gain Kᵀ: change in the estimate per unit of noise in each equation."""
-    work: Float
-    """(U R, U R) work array."""
     gradient: Float
     """(U f,) gradient Jᵀ (r − H g)."""
     v: Float
@@ -107,7 +104,7 @@ class Buffers(NamedTuple):
 def make_buffers(  # noqa: PLR0913 - the sizes of a patch
     wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
 ) -> Buffers:
-    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are for one wire."""
+    """Return zeroed buffers without factors. All sizes except ``wires`` and ``nuisances`` are per wire."""
     columns = free + nuisances
     rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
@@ -115,12 +112,31 @@ def make_buffers(  # noqa: PLR0913 - the sizes of a patch
         r=np.zeros((wires, equations)), jt=np.zeros((wires, coordinates, equations)),
         free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
         nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
-        cross_covariance=np.zeros((m, n)), innovation_covariance=np.zeros((m, m)), whitened=np.zeros((m, n)),
-        kalman_gain_t=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
+        cross_covariance=np.zeros((0, n)), innovation_covariance=np.zeros((0, m)), whitened=np.zeros((0, n)),
+        gradient=np.zeros(n), v=np.zeros(m),
         block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
         beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
         effect=np.zeros((wires, equations, effects)), factored_effect=np.zeros((wires, equations, effects)),
     )  # fmt: skip
+
+
+def with_factors(b: Buffers) -> Buffers:
+    """Return the buffers with zeroed arrays for the factors. A patch that is never solved needs none."""
+    m, n = b.v.size, b.gradient.size
+    covariance, whitened = np.zeros((2, m, n))
+    return b._replace(
+        cross_covariance=covariance, innovation_covariance=np.zeros((m, m)), whitened=whitened
+    )
+
+
+def without_factors(b: Buffers) -> Buffers:
+    """Return the buffers without the arrays of the factors, whose memory is freed."""
+    m, n = b.v.size, b.gradient.size
+    return b._replace(
+        cross_covariance=np.zeros((0, n)),
+        innovation_covariance=np.zeros((0, m)),
+        whitened=np.zeros((0, n)),
+    )
 
 
 @njit
@@ -315,28 +331,29 @@ def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def noise_variance(  # noqa: C901 - a kernel: sums as loops
-    m: int, d: Float, b: Buffers, out: Float
+    m: int, d: Float, b: Buffers, kalman_gain_t: Float, out: Float
 ) -> None:
     """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
 
-    The variance is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. V and L are read from ``b``.
+    The variance is diag(K (I + H d Hᵀ) Kᵀ). The transposed Kalman gain Kᵀ = L⁻ᵀ V, the change in the estimate
+    per unit of noise in each equation, is written to ``kalman_gain_t`` (m, U f). V and L are read from ``b``.
     """
     n = out.size
     for k in range(m):
         for j in range(n):
-            b.kalman_gain_t[k, j] = b.whitened[k, j]
-    solve_lower_transposed(b.innovation_covariance, b.kalman_gain_t, m, n)
+            kalman_gain_t[k, j] = b.whitened[k, j]
+    solve_lower_transposed(b.innovation_covariance, kalman_gain_t, m, n)
     for j in range(n):
         out[j] = 0.0
     for k in range(m):
-        row = b.kalman_gain_t[k]
+        row = kalman_gain_t[k]
         for j in range(n):
             out[j] += row[j] * row[j]
     for q in range(b.nuisance.shape[1]):
         for j in range(n):
             b.gradient[j] = 0.0
         for k in range(m):
-            value, row = b.nuisance[k, q], b.kalman_gain_t[k]
+            value, row = b.nuisance[k, q], kalman_gain_t[k]
             if value != 0.0:
                 for j in range(n):
                     b.gradient[j] += value * row[j]

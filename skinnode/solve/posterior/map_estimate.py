@@ -112,7 +112,9 @@ class MapEstimator:
         self.load_prior = LoadPrior(elastic, every)
         self._geometry = None if tolerances.exact else GeometryError(problem, elastic, tolerances)
         effects = 0 if self._geometry is None else EFFECTS
-        self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
+        self._b = kernels.without_factors(
+            kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
+        )
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
         self._enough = math.inf  # convergence tolerance for the RMS of a chord step, pitches
@@ -361,9 +363,8 @@ class MapEstimator:
         b.effect[:] = 0.0  # geometry errors have no effect at rest
 
     def _assemble(self, observation: Observation, members: Index, scale2: float, moved: Float) -> float:
-        if not self._b.whitened.size:
-            self._b = kernels.with_factors(self._b)
-        covariance, o, b = self.load_prior.covariance, observation, self._b
+        self._b = b = kernels.with_factors(self._b)
+        covariance, o = self.load_prior.covariance, observation
         trace = kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, b)
         if self._geometry is not None:
             b.factored_effect[:] = b.effect

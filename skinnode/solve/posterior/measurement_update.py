@@ -57,8 +57,9 @@ class Buffers(NamedTuple):
     """Arrays that a Gauss-Newton step writes, for one patch.
 
     Each of the U wires has K equations and f free coordinates; there are p nuisances. A reduced wire has R =
-    min(K, f + p) rows. With geometry errors, R = K. The arrays of the factors (``cross_covariance``,
-    ``innovation_covariance`` and ``whitened``) have no elements until :func:`with_factors` provides them.
+    min(K, f + p) rows. With geometry errors, R = K. The large arrays of the factors (``cross_covariance``,
+    ``innovation_covariance`` and ``whitened``) can be freed while there are no factors
+    (:func:`without_factors`).
     """
 
     r: Float
@@ -104,7 +105,7 @@ class Buffers(NamedTuple):
 def make_buffers(  # noqa: PLR0913 - the sizes of a patch
     wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
 ) -> Buffers:
-    """Return zeroed buffers without factors. All sizes except ``wires`` and ``nuisances`` are per wire."""
+    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are for one wire."""
     columns = free + nuisances
     rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
@@ -112,7 +113,7 @@ def make_buffers(  # noqa: PLR0913 - the sizes of a patch
         r=np.zeros((wires, equations)), jt=np.zeros((wires, coordinates, equations)),
         free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
         nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
-        cross_covariance=np.zeros((0, n)), innovation_covariance=np.zeros((0, m)), whitened=np.zeros((0, n)),
+        cross_covariance=np.zeros((m, n)), innovation_covariance=np.zeros((m, m)), whitened=np.zeros((m, n)),
         gradient=np.zeros(n), v=np.zeros(m),
         block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
         beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
@@ -121,21 +122,20 @@ def make_buffers(  # noqa: PLR0913 - the sizes of a patch
 
 
 def with_factors(b: Buffers) -> Buffers:
-    """Return the buffers with zeroed arrays for the factors. A patch that is never solved needs none."""
-    m, n = b.v.size, b.gradient.size
-    covariance, whitened = np.zeros((2, m, n))
-    return b._replace(
-        cross_covariance=covariance, innovation_covariance=np.zeros((m, m)), whitened=whitened
-    )
+    """Return the buffers with zeroed arrays for the factors; see :func:`without_factors`."""
+    return b if b.whitened.size else _resized(b, b.v.size)
 
 
 def without_factors(b: Buffers) -> Buffers:
-    """Return the buffers without the arrays of the factors, whose memory is freed."""
-    m, n = b.v.size, b.gradient.size
+    """Return the buffers with empty arrays instead of the factors. No kernel may use them."""
+    return _resized(b, 0)
+
+
+def _resized(b: Buffers, rows: int) -> Buffers:
     return b._replace(
-        cross_covariance=np.zeros((0, n)),
-        innovation_covariance=np.zeros((0, m)),
-        whitened=np.zeros((0, n)),
+        cross_covariance=np.zeros((rows, b.gradient.size)),
+        innovation_covariance=np.zeros((rows, b.v.size)),
+        whitened=np.zeros((rows, b.gradient.size)),
     )
 
 

@@ -238,11 +238,14 @@ def scale(
         list[int] | None,
         typer.Option(min=1, max=1000, help="Number of patches; one patch is touched. Can be repeated."),
     ] = None,
-    scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
+    scans: Annotated[
+        int,
+        typer.Option(min=1, max=10_000, help="Number of scans per measurement; fewer for large hands."),
+    ] = 20,
 ) -> None:
-    """Measure how the CPU time of simulator and host grows with skin area and touched area.
+    """Measure how the CPU time and the memory of simulator and host grow with skin area and touched area.
 
-    Hands run in virtual time. Each patch takes about 20 MB of memory.
+    Hands run in virtual time. By default, the largest hand has 1,000 patches, which takes several minutes.
     """
     from skinnode.bench import scale as bench
 

@@ -110,7 +110,7 @@ class Paths:
         return found
 
     def _squares(self, upper_m: Float, work: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in the x-y plane and in space, m², in arrays of ``work``."""
+        """Return the squared distances (U N, K M) in the plane and in space, m², in arrays of ``work``."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
         plane, square, gap = work
         for axis, out in ((0, plane), (1, gap), (2, square)):

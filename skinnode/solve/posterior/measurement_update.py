@@ -122,7 +122,7 @@ def make_buffers(  # noqa: PLR0913 - the sizes of a patch
 
 
 def with_factors(b: Buffers) -> Buffers:
-    """Return the buffers with zeroed arrays for the factors; see :func:`without_factors`."""
+    """Return the buffers with uninitialised arrays for the factors; see :func:`without_factors`."""
     return b if b.whitened.size else _resized(b, b.v.size)
 
 
@@ -133,9 +133,9 @@ def without_factors(b: Buffers) -> Buffers:
 
 def _resized(b: Buffers, rows: int) -> Buffers:
     return b._replace(
-        cross_covariance=np.zeros((rows, b.gradient.size)),
-        innovation_covariance=np.zeros((rows, b.v.size)),
-        whitened=np.zeros((rows, b.gradient.size)),
+        cross_covariance=np.empty((rows, b.gradient.size)),
+        innovation_covariance=np.empty((rows, b.v.size)),
+        whitened=np.empty((rows, b.gradient.size)),
     )
 
 

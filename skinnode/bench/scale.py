@@ -1,4 +1,4 @@
-"""Measures how the CPU time of the simulator and the host grows with skin area and number of contacts.
+"""Measures how the CPU time and the memory of simulator and host grow with skin area and contacts.
 
 A simulated hand has four patches per bus, and spheres press on some of its patches. The hands run in virtual
 time, so that every patch sends every scan even on a slow machine. The simulated buses take account of the
@@ -10,18 +10,19 @@ simulated it.
 
 from __future__ import annotations
 
-import resource
 import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
+from skinnode.bench.memory import resident_mb
 from skinnode.bench.timing import machine, take_turns
 from skinnode.canopen import indices as od
 from skinnode.config import HandConfig, parse_hand
 from skinnode.host import Host
 from skinnode.process import clock
+from skinnode.process.garbage_collection import without_long_collections
 from skinnode.protocol.command import SendMode, pack_command
 from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
@@ -31,8 +32,12 @@ from vcan_sim.timed_bus import BitRates
 from vcan_sim.timed_interface import Segment, segment
 from vcan_sim.virtual_time import VirtualClock
 
-PATCHES: Final = (1, 4, 16, 64)
+PATCHES: Final = (1, 4, 16, 64, 256, 1000)
 """Default numbers of patches; in each hand, one patch is touched."""
+MOST_FIELDS: Final = 4_000
+"""Limit on the product of patches and scans per measurement, so that large hands take a few minutes."""
+LEAST_SCANS: Final = 2
+"""Minimum number of scans per measurement."""
 FIXED: Final = 16
 """Number of patches in the hand whose number of touched patches is varied."""
 TOUCHED: Final = (0, 1, 4, 16)
@@ -50,28 +55,31 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
 
     Args:
         patches: Numbers of patches to measure; in each hand, one patch is touched.
-        scans: Number of scans per measurement.
+        scans: Number of scans per measurement; fewer for large hands (:data:`MOST_FIELDS`).
 
     Returns:
         The processor and the library versions (``machine``); the lists of rows ``area``, ``contact`` and
         ``changed``; and the result of :func:`physics`. In ``changed``, the patches send only changed chunks.
         A row contains the numbers of ``patches`` and ``touched`` patches, whether only changed chunks are
         sent (``changed_only``), the CPU times per patch and scan in ms (``nodes_ms``, ``bus_ms``,
-        ``host_ms``), the number of solved ``fields``, the ratio of virtual to real time (``faster``), and the
-        memory of the process (``memory_mb``).
+        ``host_ms``), the numbers of measured ``scans`` and solved ``fields``, the ratio of virtual to real
+        time (``faster``), and the resident memory of the process (``memory_mb``).
     """
     measure(1, 1, 2)  # compile the kernels and fill the caches
     contact = [measure(FIXED, count, scans) for count in TOUCHED]
     changed = [measure(FIXED, count, scans, changed_only=True) for count in TOUCHED[:2]]
     return {
         "machine": machine(),
-        "area": [
-            measure(count, 1, scans) for count in sorted(patches)
-        ],  # ascending, because peak memory never decreases
+        "area": [measure(count, 1, scans_of(count, scans)) for count in sorted(patches)],
         "contact": contact,
         "changed": changed,
         "physics": physics(),
     }
+
+
+def scans_of(patches: int, scans: int) -> int:
+    """Return the number of scans to measure on a hand, ``scans`` unless the hand is large."""
+    return min(scans, max(LEAST_SCANS, MOST_FIELDS // patches))
 
 
 def measure(patches: int, touched: int, scans: int, *, changed_only: bool = False) -> Row:
@@ -94,15 +102,17 @@ def measure(patches: int, touched: int, scans: int, *, changed_only: bool = Fals
             clock.sleep(_SETTLED_S)
             if changed_only:
                 _send_changed_only(hand)
-            solved, start = _solved(host), time.perf_counter()
-            clock.sleep(scans * PERIOD_MS * 1e-3)
-            real_s = time.perf_counter() - start
-            fields = _solved(host) - solved
-            for bus in segments:  # measuring the CPU time of a bus slows it down, hence the second run
-                bus.cpu_ns = Counter()
-            before = _cpu_ns(segments)
-            clock.sleep(scans * PERIOD_MS * 1e-3)
-            spent = _cpu_ns(segments) - before
+            memory_mb = resident_mb()
+            with without_long_collections():  # as in the commands that run nodes or a host
+                solved, start = _solved(host), time.perf_counter()
+                clock.sleep(scans * PERIOD_MS * 1e-3)
+                real_s = time.perf_counter() - start
+                fields = _solved(host) - solved
+                for bus in segments:  # measuring the CPU time of a bus slows it down, hence the second run
+                    bus.cpu_ns = Counter()
+                before = _cpu_ns(segments)
+                clock.sleep(scans * PERIOD_MS * 1e-3)
+                spent = _cpu_ns(segments) - before
             assert not fleet.failed
     each = 1e-6 / (patches * scans)
     return {
@@ -112,9 +122,10 @@ def measure(patches: int, touched: int, scans: int, *, changed_only: bool = Fals
         "nodes_ms": spent["nodes"] * each,
         "bus_ms": spent["bus"] * each,
         "host_ms": spent["host"] * each,
+        "scans": scans,
         "fields": fields,
         "faster": scans * PERIOD_MS * 1e-3 / real_s,
-        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "memory_mb": memory_mb,
     }
 
 

@@ -11,8 +11,6 @@ leak of one object per scan. This module imports the simulator to inject the fau
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import logging
 import os
 import random
@@ -23,11 +21,11 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from sys import getallocatedblocks
 from typing import Any, Final
 
 from skinnode.bench import soak_sums as sums
+from skinnode.bench.memory import resident_mb
 from skinnode.bench.soak_starvation import starved_processor
 from skinnode.bus_load.stuffing import load_kernels
 from skinnode.config import HandConfig, parse_hand
@@ -398,14 +396,10 @@ def _standing_still(host: Host) -> HostStats:
 
 def _size() -> _Size:
     for _ in range(3):
-        gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
-    if trim is not None:
-        trim(0)
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+        resident = resident_mb()
     return _Size(
         getallocatedblocks(),
-        pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        resident,
         threading.active_count(),
         len(os.listdir("/proc/self/fd")),
     )

@@ -237,7 +237,10 @@ def scale(
         list[int] | None,
         typer.Option(min=1, max=1000, help="Number of patches; one patch is touched. Can be repeated."),
     ] = None,
-    scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
+    scans: Annotated[
+        int,
+        typer.Option(min=1, max=10_000, help="Number of scans per measurement; fewer for large hands."),
+    ] = 20,
     real_time: Annotated[
         float,
         typer.Option(
@@ -248,10 +251,10 @@ def scale(
         ),
     ] = 10.0,
 ) -> None:
-    """Measure how the CPU time of simulator and host grows with skin area and touched area.
+    """Measure how the CPU time and the memory of simulator and host grow with skin area and touched area.
 
-    Hands run in virtual time, except for the measurements on udp_multicast. Each patch takes about 20 MB of
-    memory.
+    Hands run in virtual time, except for the measurements on udp_multicast. By default, the largest hand has
+    1,000 patches, which takes several minutes.
     """
     from skinnode.bench import real_time as multicast
     from skinnode.bench import scale as bench

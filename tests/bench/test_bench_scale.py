@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -10,12 +12,40 @@ import pytest
 from skinnode.bench import real_time, scale
 from skinnode.bench.plots.scale import draw
 from skinnode.cli.main import main
+from skinnode.host import Host
+from skinnode.process import clock
+from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 
 def test_each_scan_of_each_patch_is_solved() -> None:
     row = scale.measure(patches=5, touched=2, scans=2)  # on two buses
     assert row["fields"] == 5 * 2
     assert all(row[part] > 0.0 for part in ("nodes_ms", "bus_ms", "host_ms", "faster", "memory_mb"))
+
+
+def test_a_further_patch_takes_little_memory() -> None:
+    """Skin, node, host and solver of one patch: 1.5 MB when the limit was set, so 1,000 patches fit."""
+
+    def held_mb(patches: int) -> float:
+        hand = scale.hand_of(patches)
+        with VirtualClock(), Fleet(hand, scene=scale.scene_of(1)), Host.from_config(hand):
+            clock.sleep(1.0)
+            gc.collect()
+            return tracemalloc.get_traced_memory()[0] / 1e6
+
+    scale.measure(1, 1, 2)  # compile the kernels and fill the caches
+    tracemalloc.start()
+    try:
+        few = held_mb(4)
+        assert held_mb(12) - few < 8 * 2.5
+    finally:
+        tracemalloc.stop()
+
+
+def test_large_hands_are_measured_for_fewer_scans() -> None:
+    assert [scale.scans_of(patches, 20) for patches in (1, 200, 256, 1000)] == [20, 20, 15, 4]
+    assert scale.scans_of(1000, 1) == 1
 
 
 def test_the_command_prints_writes_and_plots(

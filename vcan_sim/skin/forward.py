@@ -18,8 +18,9 @@ strain              The resistivity ρ of a path becomes ρ (1 + β ε), where �
 
 from __future__ import annotations
 
+import contextlib
 import math
-import threading
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -70,12 +71,10 @@ class Paths:
         self._lower = np.ascontiguousarray(lower_m.reshape(-1, 3).T)
         self._radius_m = math.sqrt(2.0) * radius_m
         self._strain = strain
-        # reused, because mapping the pages of new arrays would take longer than the arithmetic
-        self._work = np.empty((3, upper_m.size // 3, self._lower.shape[1]))
-        self._lock = threading.Lock()
         self._per_m: Float | None = None
         if strain:
-            self._per_m = strain / np.sqrt(self._squares(upper_m)[1])
+            with self._work(upper_m) as work:
+                self._per_m = strain / np.sqrt(self._squares(upper_m, work)[1])
 
     def sums(self, upper_m: Float, shape: tuple[int, ...], axes: tuple[int, ...]) -> Float:
         """Return conductances summed over the electrodes of each wire.
@@ -88,13 +87,16 @@ class Paths:
         Returns:
             (U, N or 1, K, M or 1) float64, 1/m; divide by the resistivity (ohm/m) for siemens.
         """
-        with self._lock:
-            return np.asarray(self._each(upper_m).reshape(shape).sum(axis=axes, keepdims=True))
+        with self._work(upper_m) as work:
+            return np.asarray(self._each(upper_m, work).reshape(shape).sum(axis=axes, keepdims=True))
 
-    def _each(self, upper_m: Float) -> Float:
-        """Return the conductances (U N, K M) of all paths in 1/m. The next call overwrites the array."""
-        plane, square = self._squares(upper_m)
-        found: Float = self._work[2]
+    def _work(self, upper_m: Float) -> contextlib.AbstractContextManager[Float]:
+        return _borrowed((3, upper_m.size // 3, self._lower.shape[1]))
+
+    def _each(self, upper_m: Float, work: Float) -> Float:
+        """Return the conductances (U N, K M) of all paths in 1/m, in an array of ``work``."""
+        plane, square = self._squares(upper_m, work)
+        found: Float = work[2]
         with np.errstate(divide="ignore"):
             if self._radius_m:
                 _disc(plane, square, self._radius_m, out=found)
@@ -107,16 +109,36 @@ class Paths:
             found /= factor
         return found
 
-    def _squares(self, upper_m: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in the x-y plane and in space, in m², in reused arrays."""
+    def _squares(self, upper_m: Float, work: Float) -> tuple[Float, Float]:
+        """Return the squared distances (U N, K M) in the plane and in space, m², in arrays of ``work``."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
-        plane, square, gap = self._work
+        plane, square, gap = work
         for axis, out in ((0, plane), (1, gap), (2, square)):
             np.subtract(here[axis][:, None], there[axis], out=out)
             np.multiply(out, out, out=out)
         plane += gap
         square += plane
         return plane, square
+
+
+_unused: dict[tuple[int, ...], list[Float]] = {}
+
+
+@contextlib.contextmanager
+def _borrowed(shape: tuple[int, ...]) -> Iterator[Float]:
+    """Lend a work array to one thread at a time; patches of the same shape share the arrays.
+
+    The arrays are reused, because mapping the pages of new ones would take longer than the arithmetic.
+    """
+    unused = _unused.setdefault(shape, [])
+    try:
+        work = unused.pop()
+    except IndexError:
+        work = np.empty(shape)
+    try:
+        yield work
+    finally:
+        unused.append(work)
 
 
 def _disc(plane: Float, square: Float, radius_m: float, out: Float) -> None:

@@ -1,4 +1,4 @@
-"""Plots the results of ``skinnode bench scale``: CPU time versus area and number of touches."""
+"""Plots the results of ``skinnode bench scale``: CPU time and memory versus area and number of touches."""
 
 from __future__ import annotations
 
@@ -20,19 +20,25 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 4), layout="constrained")
+    figure = Figure(figsize=(13, 4), layout="constrained")
     FigureCanvasAgg(figure)
-    area, contact = figure.subplots(1, 2, sharey=True)
+    area, contact, memory = figure.subplots(1, 3)
+    contact.sharey(area)
     for axes, rows, key in ((area, figures["area"], "patches"), (contact, figures["contact"], "touched")):
         for part, (label, colour) in _PARTS.items():
             axes.plot(
                 [row[key] for row in rows], [row[part] for row in rows], "o-", color=colour, label=label
             )
-        axes.grid(visible=True, color="0.9")
-    area.set_xscale("log", base=2)
     ticks = [row["patches"] for row in figures["area"]]
-    area.set_xticks(ticks, [str(tick) for tick in ticks])
-    area.set_xlabel("patches, one of them touched")
+    memory.plot(ticks, [row["memory_mb"] for row in figures["area"]], "o-", color="tab:purple")
+    for axes in (area, contact, memory):
+        axes.grid(visible=True, color="0.9")
+    for axes in (area, memory):
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.set_xlabel("patches, one of them touched")
+    memory.set_ylabel("memory of the process, MB")
+    memory.set_ylim(bottom=0.0)
     contact.set_xlabel(f"touched patches of {figures['contact'][0]['patches']}")
     area.set_ylabel("CPU time per patch and scan, ms")
     area.set_ylim(bottom=0.0)

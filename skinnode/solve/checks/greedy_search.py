@@ -39,7 +39,10 @@ Mask = NDArray[np.bool_]
 
 
 class GreedySearch:
-    """Greedy search and its work arrays. Each stream needs its own instance.
+    """Greedy search. Each stream needs its own instance.
+
+    The work arrays (3 MB for the reference patch) exist only during a search, because a stream is seldom
+    searched.
 
     Args:
         model: Joint distribution of the readings.
@@ -51,14 +54,7 @@ class GreedySearch:
     """
 
     def __init__(self, model: ReadingModel) -> None:
-        m, loads = model.response.shape
-        upper, lower = model.shape
         self._model = model
-        self._weighted, self._diagonal = np.empty((2, m + loads))
-        self._vectors = np.empty((LOADS + m, m + loads))
-        self._share = np.empty(LOADS + m)
-        self._of_upper, self._of_lower = np.empty((upper, lower, lower)), np.empty((lower, upper, upper))
-        self._block, self._right = np.empty((max(model.shape),) * 2), np.empty(max(model.shape))
         self.kinds, self.numbers = np.full((2, LOADS), -1)
         self.gains = np.empty(LOADS)
 
@@ -76,15 +72,18 @@ class GreedySearch:
             loads: Whether the explanation may contain loads.
         """
         self.kinds[:] = -1
-        m = z.size
+        (m, count), (upper, lower) = self._model.response.shape, self._model.shape
         level, tables = self._model.level(number), self._model.loads(number)
-        self._diagonal[:] = tables.diagonal
+        weighted, diagonal = np.empty(m + count), tables.diagonal.copy()
+        vectors, share = np.empty((LOADS + m, m + count)), np.empty(LOADS + m)
+        of_upper, of_lower = np.empty((upper, lower, lower)), np.empty((lower, upper, upper))
+        block, right = np.empty((max(upper, lower),) * 2), np.empty(max(upper, lower))
         return _search(
-            z.ravel(), present.ravel().copy(), *self._model.shape, cost, loads, faults,
+            z.ravel(), present.ravel().copy(), upper, lower, cost, loads, faults,
             LEAST * float(tables.diagonal[m:].max()),
             level.precision, tables.moved, tables.gram, self._model.response_t,
-            self._weighted, self._diagonal, self._vectors, self._share, self._of_upper, self._of_lower,
-            self._block, self._right, self.kinds, self.numbers, self.gains,
+            weighted, diagonal, vectors, share, of_upper, of_lower, block, right,
+            self.kinds, self.numbers, self.gains,
         )  # fmt: skip
 
 

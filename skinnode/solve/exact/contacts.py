@@ -110,7 +110,6 @@ class ExactContacts:
             np.empty(loads),
         )
         self._share = np.ones(loads // 3)
-        self._rows = np.empty((n, loads))
         self._stiff = options.stiffness_n_per_m is not None
         self._field = np.empty((2, layout.upper_m.size))
         self._ratio, self._sorted = np.empty((2, layout.upper_m.shape[0]))
@@ -132,7 +131,8 @@ class ExactContacts:
         self._finder.reset()
         self._scale2 = 1e-4
         self._force, self._contacts, self._known = self.no_force_n, self._no_contacts, False
-        self._without: tuple[bytes, float, float, Float] | None = None
+        # wires left out, s² and ν² of the last projection, its basis, and the projected matrix B
+        self._without: tuple[bytes, float, float, Float, Float] | None = None
 
     def add(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its contacts and, unless the option ``stiffness_n_per_m`` is set, its forces.
@@ -216,21 +216,21 @@ class ExactContacts:
             orthonormalise(basis_t)
             basis, rows, shared = (
                 np.ascontiguousarray(basis_t.T),
-                self._rows,
+                np.empty_like(factors.rows) if known is None else known[4],
                 np.empty((size, self._load.size)),
             )
             np.multiply(root[:, None], factors.rows, out=rows)
             multiply(basis_t, rows, shared)
             subtract_product(basis, shared, rows)
-            known = self._without = key, self._scale2, level, basis_t
-        _, scale2, level, basis_t = known
+            known = self._without = key, self._scale2, level, basis_t, rows
+        _, scale2, level, basis_t, rows = known
         y = seen / np.sqrt(scale2 * factors.gain + level)
         part, q = np.empty(size), np.empty(self._load.size)
         multiply_vector(basis_t, y, part)
         subtract_product(part[None], basis_t, y[None])
-        multiply(y[None], self._rows, q[None])
+        multiply(y[None], rows, q[None])
         q *= scale2
-        return LoadEstimate(q.reshape(-1, 3), self._rows, np.ones(n), self._share, scale2)
+        return LoadEstimate(q.reshape(-1, 3), rows, np.ones(n), self._share, scale2)
 
 
 @functools.lru_cache(maxsize=32)

@@ -13,6 +13,7 @@ slightly from the half-space, independently of the others.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -63,8 +64,15 @@ class ElasticPrior:
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """Return the prior of ``layout`` on ``rubber``. The modulus of the rubber scales only the forces."""
-        rubber = Rubber() if rubber is None else rubber
+        """Return the prior of ``layout`` on ``rubber``. The modulus of the rubber scales only the forces.
+
+        Patches of the same layout share one prior, whose arrays must not be modified.
+        """
+        return _elastic_prior(layout, Rubber() if rubber is None else rubber)
+
+    @classmethod
+    def compute(cls, layout: PatchLayout, rubber: Rubber) -> ElasticPrior:
+        """Return a new prior, which may be modified; see :meth:`of`."""
         cells = LoadCells.of(layout)
         own, size = cells.electrode_frame, cells.size_m
         compliance = rectangle_compliance(rubber, cells.offset_m.reshape(-1, 2), size)
@@ -86,6 +94,11 @@ class ElasticPrior:
         """Return the indices (U, N) of the cells around the electrodes."""
         index = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
         return index[MARGIN : self.shape[0] - MARGIN, MARGIN : self.shape[1] - MARGIN]
+
+
+@functools.lru_cache(maxsize=8)  # for the reference patch, 30 ms and 2 MB
+def _elastic_prior(layout: PatchLayout, rubber: Rubber) -> ElasticPrior:
+    return ElasticPrior.compute(layout, rubber)
 
 
 def bonded_response(layout: PatchLayout) -> Float:

@@ -76,6 +76,7 @@ class Hyperparameters:
     def reset(self) -> None:
         """Discard the state of the stream, and reset the estimator."""
         self._estimator.reset(self._fixed or self._expected)
+        self.loads.reset()
         self.noise_factor = 1.0
         self._least = self._expected
 

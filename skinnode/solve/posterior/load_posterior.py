@@ -33,9 +33,13 @@ class LoadPosterior:
     def __init__(self, estimator: MapEstimator) -> None:
         self._estimator, self._prior = estimator, estimator.load_prior
         loads = self._prior.response.shape[1]
-        self._whitened = np.empty((estimator.equations, loads))
         self._ones = np.ones(estimator.equations)
         self._stiffness = np.empty(loads)
+        self.reset()
+
+    def reset(self) -> None:
+        """Free the memory of the last frame's covariance."""
+        self._whitened = np.empty((0, self._stiffness.size))
         self._factors = -1  # serial number of the factors to which the cached arrays belong
 
     def estimate(self) -> LoadEstimate:
@@ -63,12 +67,14 @@ class LoadPosterior:
 
     def _whiten(self) -> Float:
         """Return L⁻¹ J G (m, 3Q) for the current factors, and update the sensitivity k to each load."""
-        rows = self._whitened[: self._estimator.factored_rows]
         if self._factors != self._estimator.factors:
             self._factors = self._estimator.factors
+            if not self._whitened.size:
+                self._whitened = np.empty((self._estimator.equations, self._stiffness.size))
+            rows = self._whitened[: self._estimator.factored_rows]
             self._estimator.whiten(self._prior.response, rows)
             self._stiffness[:] = np.maximum(np.einsum("mq,mq->q", rows, rows), 1e-300)
-        return rows
+        return self._whitened[: self._estimator.factored_rows]
 
 
 @njit

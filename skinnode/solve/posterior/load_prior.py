@@ -8,6 +8,8 @@ were found reduced displacement errors by a factor of two to three.
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -40,8 +42,43 @@ the load locations have hardly changed. Without this limit, displacement errors 
 when the depth of a press doubled in one frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class UniformPrior:
+    """Prior of the free coordinates for equal expected loads at s = 1; shared by all patches of a layout."""
+
+    response: Float
+    """(U f, 3Q) displacement per unit load, pitches."""
+    response_t: Float
+    """(3Q, U f) transposed response."""
+    covariance: Float
+    """(U f, U f) matrix C, pitch²."""
+    root: Float
+    """(U f, U f) array with the Cholesky factor of C."""
+    blur: Float
+    """(Q, Q) weights of a Gaussian blur over the cells."""
+
+    @classmethod
+    def of(cls, elastic: ElasticPrior, free: Index) -> UniformPrior:
+        """Return the prior of the coordinates ``free`` (U f,) from a cache; computed on first use."""
+        return _uniform_prior(elastic, free.tobytes())
+
+
+@functools.lru_cache(maxsize=8)  # for the reference patch, 4 MB
+def _uniform_prior(elastic: ElasticPrior, free_bytes: bytes) -> UniformPrior:
+    free = np.frombuffer(free_bytes, np.int64)
+    every = free.size == len(elastic.response)
+    response = elastic.response if every else np.ascontiguousarray(elastic.response[free])
+    covariance = elastic.covariance if every else np.ascontiguousarray(elastic.covariance[np.ix_(free, free)])
+    root = covariance.copy()
+    cholesky(root, len(root))
+    response_t = np.ascontiguousarray(response.T)
+    return UniformPrior(response, response_t, covariance, root, _blur(elastic.shape))
+
+
 class LoadPrior:
     """Prior u ~ N(0, s² C) of the free coordinates u of a patch, for loads with individual variances.
+
+    While equal loads are expected everywhere, the prior has no large arrays of its own.
 
     Args:
         elastic: Elastic prior of the patch.
@@ -50,20 +87,18 @@ class LoadPrior:
     Attributes:
         scale2: s², pitch².
         share: (Q,) load variance of each cell, relative to s²; the mean is 1.
-        covariance: (U f, U f) matrix C.
-        uniform: (U f, U f) matrix C for equal expected loads over the whole patch.
+        covariance: (U f, U f) matrix C; read-only.
+        uniform: (U f, U f) matrix C for equal expected loads over the whole patch; read-only.
         response: (U f, 3Q) displacement per unit load, pitches.
         version: Number of times that C has been rebuilt.
     """
 
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
-        self.response = np.ascontiguousarray(elastic.response[free])
-        self.uniform = np.ascontiguousarray(elastic.covariance[np.ix_(free, free)])
-        self.covariance, self._root = self.uniform.copy(), np.empty_like(self.uniform)
-        self._response_t = np.ascontiguousarray(self.response.T)
-        self._blur = _blur(elastic.shape)
+        self._of_layout = UniformPrior.of(elastic, free)
+        self.response, self.uniform = self._of_layout.response, self._of_layout.covariance
+        self.covariance, self._root = self.uniform, self._of_layout.root
         self.scale2 = 1.0
-        self.share = np.ones(len(self._blur))
+        self.share = np.ones(len(self._of_layout.blur))
         self.version = 0
         self._loads: tuple[Float, Float] | None = None  # last displacement and its mean loads
 
@@ -71,8 +106,8 @@ class LoadPrior:
         """Expect equal loads over the whole patch, with the scale s² = ``scale2``, pitch²."""
         self.scale2 = scale2
         self.share[:] = 1.0
-        self.covariance[:] = self.uniform
-        self._made_anew(self.uniform)
+        self.covariance, self._root = self.uniform, self._of_layout.root
+        self._made_anew()
 
     def localise(self, variance: Float) -> bool:
         """Set the variances of the loads, and rebuild the prior if they have changed enough.
@@ -90,9 +125,13 @@ class LoadPrior:
             return False
         self.scale2 = mean
         self.share[:] = share
-        multiply(self.response * np.repeat(share, 3), self._response_t, self.covariance)
+        if self.covariance is self.uniform:
+            self.covariance, self._root = np.empty_like(self.uniform), np.empty_like(self.uniform)
+        multiply(self.response * np.repeat(share, 3), self._of_layout.response_t, self.covariance)
         self.covariance[np.diag_indices_from(self.covariance)] += SLACK**2
-        self._made_anew(self.covariance)
+        self._root[:] = self.covariance
+        cholesky(self._root, len(self._root))
+        self._made_anew()
         return True
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
@@ -109,7 +148,7 @@ class LoadPrior:
         """
         floor = LOCAL_FLOOR * float(found.mean()) + least
         wanted = np.empty_like(found)
-        multiply_vector(self._blur, found, wanted)
+        multiply_vector(self._of_layout.blur, found, wanted)
         wanted += floor
         if certain and (self.share == 1.0).all():
             return wanted
@@ -129,7 +168,7 @@ class LoadPrior:
         z, q = displacement.copy(), np.empty(self.response.shape[1])
         solve_lower_vector(self._root, z, z.size)
         solve_lower_transposed_vector(self._root, z, z.size)
-        multiply_vector(self._response_t, z, q)
+        multiply_vector(self._of_layout.response_t, z, q)
         self._loads = displacement, q.reshape(-1, 3) * self.share[:, None]
         return self._loads[1]
 
@@ -141,9 +180,7 @@ class LoadPrior:
         solve_lower_vector(self._root, displacement, displacement.size)
         return float(displacement @ displacement)
 
-    def _made_anew(self, covariance: Float) -> None:
-        self._root[:] = covariance
-        cholesky(self._root, len(self._root))
+    def _made_anew(self) -> None:
         self.version += 1
         self._loads = None
 

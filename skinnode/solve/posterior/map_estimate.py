@@ -112,7 +112,9 @@ class MapEstimator:
         self.load_prior = LoadPrior(elastic, every)
         self._geometry = None if tolerances.exact else GeometryError(problem, elastic, tolerances)
         effects = 0 if self._geometry is None else EFFECTS
-        self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
+        self._b = kernels.without_factors(
+            kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
+        )
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
         self._enough = math.inf  # convergence tolerance for the RMS of a chord step, pitches
@@ -146,11 +148,15 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest without factors, and expect equal loads everywhere with s² = ``scale2``, pitch²."""
+        """Return to rest, and expect equal loads everywhere with s² = ``scale2``, pitch².
+
+        The memory of the factors is freed, so that a hand needs memory only for the patches in contact.
+        """
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()
         self.load_prior.spread(scale2)
+        self._b = kernels.without_factors(self._b)
 
     def forget_factors(self) -> None:
         """Discard the factors and the standard deviations."""
@@ -291,7 +297,7 @@ class MapEstimator:
         """Return the number of parameters that the data determine (MacKay's γ)."""
         if self._gamma is None:
             b, m = self._b, self.factored_rows
-            inverse_diagonal(b.innovation_covariance, b.work, b.v, m)
+            inverse_diagonal(b.innovation_covariance, np.empty_like(b.innovation_covariance), b.v, m)
             self._gamma = m - float(b.v[:m].sum())
         return self._gamma
 
@@ -357,7 +363,8 @@ class MapEstimator:
         b.effect[:] = 0.0  # geometry errors have no effect at rest
 
     def _assemble(self, observation: Observation, members: Index, scale2: float, moved: Float) -> float:
-        covariance, o, b = self.load_prior.covariance, observation, self._b
+        self._b = b = kernels.with_factors(self._b)
+        covariance, o = self.load_prior.covariance, observation
         trace = kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, b)
         if self._geometry is not None:
             b.factored_effect[:] = b.effect
@@ -367,10 +374,11 @@ class MapEstimator:
 
     def _newton(self, observation: Observation, members: Index) -> float:
         """Take a Gauss-Newton step with new factors; return max |step| in pitches, or inf on failure."""
-        b, prior = self._b, self.load_prior
+        prior = self.load_prior
         self._factored = None
         self._linearise(observation, self.moved, members)
         self._assemble(observation, members, prior.scale2, self.moved)
+        b = self._b
         self.factorisations += 1
         self.factors += 1
         if not cholesky(b.innovation_covariance, members.size * self._rows):
@@ -416,10 +424,11 @@ class MapEstimator:
         self._gamma = None
         b.whitened[:m] = b.cross_covariance[:m]
         solve_lower(b.innovation_covariance, b.whitened, m, b.whitened.shape[1])
-        kernels.noise_variance(m, observation.d, b, self.noise_variance)
+        kalman_gain_t = np.empty((m, b.whitened.shape[1]))
+        kernels.noise_variance(m, observation.d, b, kalman_gain_t, self.noise_variance)
         if self._geometry is not None:
             out = self.noise_variance
-            geometry_error.add_variance(self.members, b.factored_effect, b.kalman_gain_t, self._scratch, out)
+            geometry_error.add_variance(self.members, b.factored_effect, kalman_gain_t, self._scratch, out)
         kernels.standard_deviations(
             m, prior.covariance, prior.scale2, self.noise_variance, PRIOR_DOUBT, SMOOTH_SHARE, self.std,
             self.core, b,

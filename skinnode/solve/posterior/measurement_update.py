@@ -57,7 +57,9 @@ class Buffers(NamedTuple):
     """Arrays that a Gauss-Newton step writes, for one patch.
 
     Each of the U wires has K equations and f free coordinates; there are p nuisances. A reduced wire has R =
-    min(K, f + p) rows. With geometry errors, R = K.
+    min(K, f + p) rows. With geometry errors, R = K. The large arrays of the factors (``cross_covariance``,
+    ``innovation_covariance`` and ``whitened``) can be freed while there are no factors
+    (:func:`without_factors`).
     """
 
     r: Float
@@ -78,10 +80,6 @@ class Buffers(NamedTuple):
     """(U R, U R) innovation covariance S; the factorisation overwrites it with the Cholesky factor L."""
     whitened: Float
     """(U R, U f) whitened cross-covariance V = L⁻¹ (s² J C)."""
-    kalman_gain_t: Float
-    """(U R, U f) transposed Kalman gain Kᵀ: change in the estimate per unit of noise in each equation."""
-    work: Float
-    """(U R, U R) work array."""
     gradient: Float
     """(U f,) gradient Jᵀ (r − H g)."""
     v: Float
@@ -116,11 +114,29 @@ def make_buffers(  # noqa: PLR0913 - the sizes of a patch
         free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
         nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
         cross_covariance=np.zeros((m, n)), innovation_covariance=np.zeros((m, m)), whitened=np.zeros((m, n)),
-        kalman_gain_t=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
+        gradient=np.zeros(n), v=np.zeros(m),
         block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
         beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
         effect=np.zeros((wires, equations, effects)), factored_effect=np.zeros((wires, equations, effects)),
     )  # fmt: skip
+
+
+def with_factors(b: Buffers) -> Buffers:
+    """Return the buffers with uninitialised arrays for the factors; see :func:`without_factors`."""
+    return b if b.whitened.size else _resized(b, b.v.size)
+
+
+def without_factors(b: Buffers) -> Buffers:
+    """Return the buffers with empty arrays instead of the factors. No kernel may use them."""
+    return _resized(b, 0)
+
+
+def _resized(b: Buffers, rows: int) -> Buffers:
+    return b._replace(
+        cross_covariance=np.empty((rows, b.gradient.size)),
+        innovation_covariance=np.empty((rows, b.v.size)),
+        whitened=np.empty((rows, b.gradient.size)),
+    )
 
 
 @njit
@@ -315,28 +331,29 @@ def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def noise_variance(  # noqa: C901 - a kernel: sums as loops
-    m: int, d: Float, b: Buffers, out: Float
+    m: int, d: Float, b: Buffers, kalman_gain_t: Float, out: Float
 ) -> None:
     """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
 
-    The variance is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. V and L are read from ``b``.
+    The variance is diag(K (I + H d Hᵀ) Kᵀ). The transposed Kalman gain Kᵀ = L⁻ᵀ V, the change in the estimate
+    per unit of noise in each equation, is written to ``kalman_gain_t`` (m, U f). V and L are read from ``b``.
     """
     n = out.size
     for k in range(m):
         for j in range(n):
-            b.kalman_gain_t[k, j] = b.whitened[k, j]
-    solve_lower_transposed(b.innovation_covariance, b.kalman_gain_t, m, n)
+            kalman_gain_t[k, j] = b.whitened[k, j]
+    solve_lower_transposed(b.innovation_covariance, kalman_gain_t, m, n)
     for j in range(n):
         out[j] = 0.0
     for k in range(m):
-        row = b.kalman_gain_t[k]
+        row = kalman_gain_t[k]
         for j in range(n):
             out[j] += row[j] * row[j]
     for q in range(b.nuisance.shape[1]):
         for j in range(n):
             b.gradient[j] = 0.0
         for k in range(m):
-            value, row = b.nuisance[k, q], b.kalman_gain_t[k]
+            value, row = b.nuisance[k, q], kalman_gain_t[k]
             if value != 0.0:
                 for j in range(n):
                     b.gradient[j] += value * row[j]

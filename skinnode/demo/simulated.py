@@ -22,7 +22,8 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
     """Return a copy of the hand for simulated patches.
 
     All buses are replaced with virtual buses (UDP multicast), because simulated nodes must never send on a
-    bus with real nodes. Their frames stay on this machine (``hop_limit`` 0). All tolerances are "exact", because simulated patches match their layouts exactly.
+    bus with real nodes. Their frames stay on this machine (``hop_limit`` 0). All tolerances are "exact",
+    because simulated patches match their layouts exactly.
     """
     exact = TolerancesConfig.model_validate("exact")
     patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtCommand, NmtState
-from skinnode.config import BusConfig
+from skinnode.config import BusConfig, HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import BusStats, Dispatcher, PortCounters
@@ -37,10 +37,9 @@ from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline
 from skinnode.model.frames import FieldFrame
 from skinnode.process import clock
-from skinnode.record.journal import SUFFIX, facts_of, read_journal
-from skinnode.record.recorder import channels
+from skinnode.record.journal import facts_of
+from skinnode.record.sources import open_log, open_recording
 from skinnode.text.words import counted
-from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
 """Maximum pause between replayed frames, s.
@@ -59,7 +58,13 @@ def _never() -> bool:
     return False
 
 
-def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[[], bool] = _never) -> Replay:
+def replay(
+    path: Path | str,
+    *,
+    speed: float | None = None,
+    cancelled: Callable[[], bool] = _never,
+    hand: HandConfig | None = None,
+) -> Replay:
     """Open a recording and return an iterable of its fields.
 
     Example::
@@ -70,29 +75,36 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
     At any ``speed``, the replay solves every scan that was solved live.
 
     Args:
-        path: File ending in .log or .blf.
+        path: File ending in .mcap, or in .log, .blf or .asc with its journal in the same folder.
         speed: Replay speed relative to the recording: 2 is twice as fast; None replays as fast as possible.
         cancelled: Function called before each frame; returning True has the effect of :meth:`Replay.stop`.
+        hand: Hand for a log without a journal, such as a candump log of another master; a journal is then
+            not read. See :func:`skinnode.record.sources.open_log`.
 
     Raises:
         ConfigError: The recording cannot be read, or ``speed`` is not positive.
     """
-    return Replay(Path(path), speed, cancelled)
+    return Replay(Path(path), speed, cancelled, hand)
 
 
 class Replay:
     """Replay of a recording, created by :func:`replay`. A replay can be iterated only once."""
 
-    def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
+    def __init__(
+        self,
+        path: Path,
+        speed: float | None,
+        cancelled: Callable[[], bool] = _never,
+        hand: HandConfig | None = None,
+    ) -> None:
         if speed is not None and not 0 < speed < float("inf"):
             raise ConfigError("speed", speed, "a positive number")
-        if not path.name:
-            raise ConfigError("recording", str(path), "a file ending in .log or .blf")
-        header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
+        recording = open_recording(path) if hand is None else open_log(path, hand)
+        header, events, self.complaints = recording.header, recording.events, recording.complaints
         """One-line message for each unreadable part of the journal."""
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
-        self.log = FrameLogReader(path)
+        self.log = recording.frames
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
@@ -100,7 +112,9 @@ class Replay:
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None
-        self._journal = path.with_suffix(SUFFIX).name
+        self._journal = recording.journal
+        self.notes = recording.notes
+        """Assumptions that were made because the log has no journal."""
         self.incomplete: str | None = None
         """Description of the frames missing from the log; None if none are known to be missing."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
@@ -112,12 +126,8 @@ class Replay:
             bus.name: _Bus(bus, self, [event for event in events if event["bus"] == bus.name])
             for bus in self.hand.buses
         }
-        names = channels(self.hand)
-        by_number = path.suffix == ".blf"
-        self._by_channel = {
-            str(number) if by_number else names[bus.name]: self._buses[bus.name]
-            for number, bus in enumerate(self.hand.buses)
-        }
+        self._by_channel = {channel: self._buses[bus] for channel, bus in recording.bus_of.items()}
+        self.foreign = recording.foreign
         self.strange = 0
         """Number of frames on channels that belong to no bus of the hand."""
 
@@ -133,11 +143,11 @@ class Replay:
             self._read += 1
             if self._first_ns is None:
                 self._first_ns = frame.t_ns
-            bus = self._by_channel.get(channel)
+            bus = self._by_channel.get(channel) or self._only_bus(channel)
             if bus is None:
                 self.strange += 1
                 continue
-            bus.take(frame, sent=sent, whole=not self.log.damaged)
+            bus.take(frame, sent=sent, whole=not (self.log.damaged or self.foreign))
             while (field := fields.get(0.0)) is not None:
                 yield field
         self.log.close()
@@ -148,7 +158,17 @@ class Replay:
         while (field := fields.get(0.0)) is not None:
             yield field
 
+    def _only_bus(self, channel: str) -> _Bus | None:
+        """Assign the first unknown channel of a foreign log to the bus of the hand if there is only one."""
+        if not self.foreign or len(self._buses) != 1 or self._read > 1:
+            return None
+        (bus,) = self._buses.values()
+        self._by_channel = {channel: bus}
+        return bus
+
     def _lack(self) -> str | None:
+        if self.foreign:
+            return None if self._read else "contains no frames"
         if not self.ended:
             span_s = (self._now_ns - (self._first_ns or 0)) * 1e-9
             return "was not ended properly: " + (
@@ -265,6 +285,7 @@ class _Bus:
             heard.stream.leave_out([e["received_ns"] for e in mine], _ROUNDING_NS)
         self._events = deque(events)
         self._solvers: dict[str, ScanSolver | None] = {}
+        self._without_baseline: set[str] = set()
         self._received = self._sent = 0
         self._of_heartbeat = {
             od.heartbeat_cob_id(patch.node_id): self.patches[patch.name].monitor
@@ -286,6 +307,8 @@ class _Bus:
             self._happen(self._events.popleft())
         self._received += 1
         self._dispatcher.dispatch((frame,))
+        if self._replay.foreign:
+            self._go_on(frame.can_id)
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
             if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # no fault, because the host commanded it
@@ -294,6 +317,24 @@ class _Bus:
             for heard in self.patches.values():
                 heard.stream.poll(frame.t_ns)
         self._dispatcher.measure(frame.t_ns)
+
+    def _go_on(self, can_id: int) -> None:
+        """Go on with the same solver after a node has restarted; no journal says when the host did.
+
+        After a change of the baseline, scans remain withheld, because the new baseline is unknown.
+        """
+        for name, heard in self.patches.items():
+            solver = self._solvers.get(name)
+            if not heard.stream.withholding or solver is None or name in self._without_baseline:
+                continue
+            if self._of_heartbeat.get(can_id) is heard.monitor:
+                heard.stream.resume(solver, heard.stream.withholdings, anew=True)
+            else:
+                self._without_baseline.add(name)
+                self._replay.complaints.append(
+                    f"{name}: its baseline changed; its later scans cannot be solved, "
+                    "because the log does not contain the new baseline"
+                )
 
     def _on_command(self, data: bytes) -> None:
         """Process an NMT command from the host, which sets its nodes to pre-operational when it exits."""

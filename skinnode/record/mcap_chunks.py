@@ -1,0 +1,220 @@
+"""Reads the messages of an MCAP file chunk by chunk, even if the file is damaged or lacks its end.
+
+The library's own readers stop at the first damaged record. This reader skips damaged parts, and records where
+they are. The library parses the records and checks the checksum of each chunk.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import struct
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
+
+from skinnode.errors import ConfigError
+from skinnode.transport.frame_log_reader import DAMAGES_KEPT, Damage
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+
+_HEAD: Final = struct.Struct("<BQ")  # opcode and length of each record
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # of a chunk: two times, size, checksum, length of the next word
+_COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
+_MOST_CHUNK: Final = 1 << 26
+"""Maximum size of a chunk before compression, bytes; larger sizes are due to damage. Usual chunks have 1 MiB."""
+_AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
+
+
+@dataclass(frozen=True, slots=True)
+class McapMessage:
+    """Message of an MCAP file with its channel and the name of its schema."""
+
+    message: Message
+    channel: Channel
+    schema: str
+    offset: int
+    """Offset of the chunk in the file, bytes."""
+
+
+class McapChunks:
+    """Messages of an MCAP file in the order of the file.
+
+    Args:
+        path: The file.
+        check: Function called with each schema that is read; its exceptions are propagated.
+
+    Raises:
+        ConfigError: The file cannot be read or is not an MCAP file.
+    """
+
+    def __init__(self, path: Path, check: Callable[[Schema], None]) -> None:
+        self.path, self._check = path, check
+        self._file = _open(path)
+        self.damages: list[Damage] = []
+        """First :data:`DAMAGES_KEPT` damaged parts of the file."""
+        self.damaged = 0
+        """Number of damaged parts found so far."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def messages(self, names: Collection[str]) -> Iterator[McapMessage]:
+        """Yield the messages with some schemas; chunks that contain no such message are not decompressed.
+
+        Args:
+            names: Names of the schemas.
+        """
+
+        def wanted(channel: int) -> bool:
+            schema = schemas.get(channels[channel].schema_id) if channel in channels else None
+            return channel not in channels or (schema is not None and schema.name in names)
+
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        self.damages, self.damaged = [], 0
+        with mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            for record, indexed in self._records(data):
+                if indexed is not None and not any(map(wanted, indexed)):
+                    continue
+                offset, content = record
+                for item in self._content(content, offset):
+                    if isinstance(item, Schema):
+                        self._check(item)
+                        schemas[item.id] = item
+                    elif isinstance(item, Channel):
+                        channels[item.id] = item
+                    elif isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id):
+                        channel = channels[item.channel_id]
+                        yield McapMessage(item, channel, schemas[channel.schema_id].name, offset)
+
+    def complain(self, offset: int, what: str) -> None:
+        """Record a damaged part of the file."""
+        self.damaged += 1
+        if len(self.damages) < DAMAGES_KEPT:
+            self.damages.append(Damage(None, offset, what))
+
+    def _content(self, record: McapRecord, offset: int) -> list[McapRecord]:
+        """Return the records in a chunk, or the record itself if it is not a chunk."""
+        if not isinstance(record, Chunk):
+            return [record]
+        try:
+            return breakup_chunk(_decompressed(record), validate_crc=True)
+        except Exception as error:  # the decompressors and the library raise various exceptions
+            self.complain(offset, f"a chunk that cannot be read ({type(error).__name__}: {error})")
+            return []
+
+    def _records(
+        self, data: mmap.mmap
+    ) -> Iterator[tuple[tuple[int, McapRecord], frozenset[int] | None]]:
+        """Yield each chunk, schema, channel and message with its offset.
+
+        The second item contains the numbers of the channels that have messages in a chunk; None if unknown.
+        """
+        at, size = len(MAGIC), len(data)
+        while at < size:
+            end = _end_of(data, at)
+            opcode = data[at]
+            if opcode in _AT_THE_END and end is not None:
+                return
+            if end is None:
+                following = _find_chunk(data, at + 1)
+                self.complain(at, "truncated" if following == size else "no record")
+                at = following
+                continue
+            if opcode in (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                try:
+                    record = _parsed(opcode, data[at + _HEAD.size : end])
+                except Exception as error:  # the library raises various exceptions for invalid data
+                    self.complain(at, f"a record that cannot be read ({type(error).__name__}: {error})")
+                    at = _find_chunk(data, at + 1)
+                    continue
+                yield (at, record), _indexed(data, end) if opcode == Opcode.CHUNK else None
+            at = end
+
+
+def _open(path: Path) -> BinaryIO:
+    allowed = "an MCAP file"
+    try:
+        file = path.open("rb")
+        try:
+            if file.read(len(MAGIC)) == MAGIC:
+                return file
+        except OSError as error:
+            allowed = f"an MCAP file that can be read ({error.strerror})"
+        file.close()
+    except OSError as error:
+        allowed = f"a file that can be read ({error.strerror})"
+    raise ConfigError("recording", str(path), allowed) from None
+
+
+def _parsed(opcode: int, data: bytes) -> McapRecord:
+    stream = ReadDataStream(io.BytesIO(data))
+    if opcode == Opcode.CHUNK:
+        return Chunk.read(stream)
+    if opcode == Opcode.SCHEMA:
+        return Schema.read(stream)
+    if opcode == Opcode.CHANNEL:
+        return Channel.read(stream)
+    return Message.read(stream, len(data))
+
+
+def _end_of(data: mmap.mmap, at: int) -> int | None:
+    """Return the offset after the record at ``at``; None if there is no complete record."""
+    if at + _HEAD.size > len(data):
+        return None
+    opcode, length = _HEAD.unpack_from(data, at)
+    known = 0 < opcode <= Opcode.DATA_END or opcode >= 0x80  # 0x80 and above are private records
+    end = int(at + _HEAD.size + length)
+    return end if known and end <= len(data) else None
+
+
+def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:
+    """Return the numbers of the channels in the message indexes that follow a chunk; None if there are none."""
+    found = set()
+    while (end := _end_of(data, at)) is not None and data[at] == Opcode.MESSAGE_INDEX:
+        if end < at + _HEAD.size + 2:
+            return None
+        found.add(int.from_bytes(data[at + _HEAD.size : at + _HEAD.size + 2], "little"))
+        at = end
+    return frozenset(found) or None
+
+
+def _find_chunk(data: mmap.mmap, at: int) -> int:
+    """Return the offset of the next complete chunk; the length of the file if there is none."""
+    while (at := data.find(bytes([Opcode.CHUNK]), at)) >= 0:
+        end = _end_of(data, at)
+        if end is not None and end >= at + _HEAD.size + _CHUNK_HEAD.size:
+            _, _, size, _, length = _CHUNK_HEAD.unpack_from(data, at + _HEAD.size)
+            word = at + _HEAD.size + _CHUNK_HEAD.size
+            if size <= _MOST_CHUNK and length <= 4 and data[word : word + length] in _COMPRESSIONS:
+                return at
+        at += 1
+    return len(data)
+
+
+def _decompressed(chunk: Chunk) -> Chunk:
+    """Return the chunk without compression. Raises ValueError if it would be larger than it claims."""
+    size, data = chunk.uncompressed_size, chunk.data
+    if size > _MOST_CHUNK:
+        raise ValueError(f"{size} bytes, must be at most {_MOST_CHUNK}")
+    if chunk.compression == "zstd":
+        import zstandard
+
+        if zstandard.frame_content_size(data) > size:
+            raise ValueError("contains more than it claims")
+        data = zstandard.decompress(data, max_output_size=size)
+    elif chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+    elif chunk.compression:
+        raise ValueError(f"unknown compression {chunk.compression[:20]!r}")
+    return replace(chunk, compression="", data=data)

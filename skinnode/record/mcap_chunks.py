@@ -34,11 +34,11 @@ _AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
 
 @dataclass(frozen=True, slots=True)
 class McapMessage:
-    """Message of an MCAP file with its channel and the name of its schema."""
+    """Message of an MCAP file with its channel and its schema, None if the message has no schema."""
 
     message: Message
     channel: Channel
-    schema: str
+    schema: Schema | None
     offset: int
     """Offset of the chunk in the file, bytes."""
 
@@ -66,16 +66,18 @@ class McapChunks:
         """Close the file."""
         self._file.close()
 
-    def messages(self, names: Collection[str]) -> Iterator[McapMessage]:
+    def messages(self, names: Collection[str] | None) -> Iterator[McapMessage]:
         """Yield the messages with some schemas; chunks that contain no such message are not decompressed.
 
         Args:
-            names: Names of the schemas.
+            names: Names of the schemas; None for all messages.
         """
 
         def wanted(channel: int) -> bool:
-            schema = schemas.get(channels[channel].schema_id) if channel in channels else None
-            return channel not in channels or (schema is not None and schema.name in names)
+            if names is None or channel not in channels:
+                return True
+            schema = schemas.get(channels[channel].schema_id)
+            return schema is not None and schema.name in names
 
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
@@ -93,7 +95,7 @@ class McapChunks:
                         channels[item.id] = item
                     elif isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id):
                         channel = channels[item.channel_id]
-                        yield McapMessage(item, channel, schemas[channel.schema_id].name, offset)
+                        yield McapMessage(item, channel, schemas.get(channel.schema_id), offset)
 
     def complain(self, offset: int, what: str) -> None:
         """Record a damaged part of the file."""

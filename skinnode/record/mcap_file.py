@@ -13,10 +13,9 @@ from __future__ import annotations
 import contextlib
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from skinnode.config import HandConfig
-from skinnode.errors import ConfigError
 from skinnode.messages.can_frames import FrameEncoder
 from skinnode.messages.contacts import WRENCH, contact_wrenches, contacts_message
 from skinnode.messages.definitions import CAN_FRAME, CONTACTS, FD_FRAME, FIELD_INFO, JOURNAL_LINE
@@ -31,6 +30,7 @@ from skinnode.host.skeleton import Skeleton
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.transport.frame import Frame
+from skinnode.transport.frame_log import create_binary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -78,7 +78,7 @@ class McapFile:
         self.path, self._hand = path, hand
         self._topics = HandTopics.of(hand)
         self._skeleton = Skeleton.of(hand)
-        self._file = _create(path)
+        self._file = create_binary(path)
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=PROFILE, library="skinnode")
         self._encoders = {bus.name: FrameEncoder(bus.name) for bus in hand.buses}
@@ -199,12 +199,3 @@ class McapFile:
         self._sequence[channel] = 0
         return channel
 
-
-def _create(path: Path) -> BinaryIO:
-    try:
-        return path.open("xb")
-    except FileExistsError:
-        allowed = "a new file; this one exists and is not overwritten"
-        raise ConfigError("recording", str(path), allowed) from None
-    except OSError as error:
-        raise ConfigError("recording", str(path), f"a file that can be created ({error.strerror})") from None

@@ -70,9 +70,10 @@ class McapReader:
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         for item in self._chunks.messages((CAN_FRAME, FD_FRAME)):
+            assert item.schema is not None  # selected by its name
             bus, sent = _bus_of(item.channel)
             try:
-                yield LoggedFrame(frame_of(item.message.data, item.schema), bus, sent)
+                yield LoggedFrame(frame_of(item.message.data, item.schema.name), bus, sent)
             except ValueError as error:
                 self._chunks.complain(item.offset, f"a message that cannot be read ({error})")
         self.close()

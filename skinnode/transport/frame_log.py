@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TextIO
+from typing import BinaryIO, Final, NamedTuple, TextIO
 
 import can
 
 from skinnode.errors import ConfigError
 from skinnode.transport.frame import Frame
 
-LogFormat = Literal["log", "blf"]
 SUFFIXES: Final = (".log", ".blf")
 """Suffixes of logs that can be recorded: a file whose process was killed is readable up to the last flush."""
 WRITABLE: Final = (*SUFFIXES, ".asc")
@@ -138,8 +138,25 @@ def create(path: Path) -> TextIO:
     Raises:
         ConfigError: if the file already exists or cannot be created.
     """
-    try:
+    with _errors_of(path):
         return path.open("x", encoding="ascii")
+
+
+def create_binary(path: Path) -> BinaryIO:
+    """Create a new binary file.
+
+    Raises:
+        ConfigError: if the file already exists or cannot be created.
+    """
+    with _errors_of(path):
+        return path.open("xb")
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    """Convert errors of opening a new file to ConfigError."""
+    try:
+        yield
     except FileExistsError:
         raise ConfigError(
             "recording", str(path), "a new file; this one exists and is not overwritten"

@@ -50,7 +50,7 @@ int64 since          # number of the scan in which the fault was found
 float64 deviations   # significance of the fault in standard deviations
 """,
     FIELD_INFO: """\
-# Data of a displacement field that sensor_msgs/PointCloud2 cannot contain. The header equals that of the cloud.
+# Data of a displacement field that sensor_msgs/PointCloud2 cannot contain. Its header is that of the cloud.
 uint16 VERSION=1
 std_msgs/Header header
 string patch
@@ -79,7 +79,7 @@ float64 solve_time_s
 skinnode_msgs/DataFault[] faults
 """,
     CONTACT: """\
-# Contact of a body with the skin, in the frame of the patch. Variables that end in _std are standard deviations.
+# Contact of a body with the skin, in the frame of the patch. Names ending in _std are standard deviations.
 uint16 VERSION=1
 geometry_msgs/Point position         # centre of the normal load on the undeformed skin, m
 geometry_msgs/Vector3 position_std

@@ -23,7 +23,7 @@ the event, and ``t_ns`` its time on the host's monotonic clock.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -149,11 +149,18 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], l
         with path.open("rb") as file:
             kept: list[bytes] = []
             lines = iter(lambda: file.readline(_LONGEST_LINE), b"")
-            parsed = parse_journal(str(path), path.name, (kept.append(line) or line for line in lines))
+            parsed = parse_journal(str(path), path.name, _noted(lines, kept))
             return *parsed, kept
     except OSError as error:
-        allowed = f"a readable journal next to the log ({error.strerror})"
+        allowed = f"a journal next to the log ({error.strerror}); for a log without a journal, give --hand"
         raise ConfigError("recording", str(path), allowed) from None
+
+
+def _noted(lines: Iterable[bytes], kept: list[bytes]) -> Iterator[bytes]:
+    """Yield the lines, and append them to ``kept``."""
+    for line in lines:
+        kept.append(line)
+        yield line
 
 
 def parse_journal(

@@ -28,7 +28,7 @@ _HEAD: Final = struct.Struct("<BQ")  # opcode and length of each record
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # of a chunk: two times, size, checksum, length of the next word
 _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _MOST_CHUNK: Final = 1 << 26
-"""Maximum size of a chunk before compression, bytes; larger sizes are due to damage. Usual chunks have 1 MiB."""
+"""Maximum size of a chunk before compression, bytes; usually 1 MiB. Larger sizes are due to damage."""
 _AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
 
 
@@ -93,7 +93,9 @@ class McapChunks:
                         schemas[item.id] = item
                     elif isinstance(item, Channel):
                         channels[item.id] = item
-                    elif isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id):
+                    elif (
+                        isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id)
+                    ):
                         channel = channels[item.channel_id]
                         yield McapMessage(item, channel, schemas.get(channel.schema_id), offset)
 
@@ -108,14 +110,13 @@ class McapChunks:
         if not isinstance(record, Chunk):
             return [record]
         try:
-            return breakup_chunk(_decompressed(record), validate_crc=True)
+            content: list[McapRecord] = breakup_chunk(_decompressed(record), validate_crc=True)
+            return content
         except Exception as error:  # the decompressors and the library raise various exceptions
             self.complain(offset, f"a chunk that cannot be read ({type(error).__name__}: {error})")
             return []
 
-    def _records(
-        self, data: mmap.mmap
-    ) -> Iterator[tuple[tuple[int, McapRecord], frozenset[int] | None]]:
+    def _records(self, data: mmap.mmap) -> Iterator[tuple[tuple[int, McapRecord], frozenset[int] | None]]:
         """Yield each chunk, schema, channel and message with its offset.
 
         The second item contains the numbers of the channels that have messages in a chunk; None if unknown.
@@ -159,13 +160,17 @@ def _open(path: Path) -> BinaryIO:
 
 def _parsed(opcode: int, data: bytes) -> McapRecord:
     stream = ReadDataStream(io.BytesIO(data))
-    if opcode == Opcode.CHUNK:
-        return Chunk.read(stream)
-    if opcode == Opcode.SCHEMA:
-        return Schema.read(stream)
-    if opcode == Opcode.CHANNEL:
-        return Channel.read(stream)
-    return Message.read(stream, len(data))
+    record: McapRecord
+    match opcode:
+        case Opcode.CHUNK:
+            record = Chunk.read(stream)
+        case Opcode.SCHEMA:
+            record = Schema.read(stream)
+        case Opcode.CHANNEL:
+            record = Channel.read(stream)
+        case _:
+            record = Message.read(stream, len(data))
+    return record
 
 
 def _end_of(data: mmap.mmap, at: int) -> int | None:
@@ -179,7 +184,7 @@ def _end_of(data: mmap.mmap, at: int) -> int | None:
 
 
 def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:
-    """Return the numbers of the channels in the message indexes that follow a chunk; None if there are none."""
+    """Return the numbers of the channels in the message indexes after a chunk; None if there are none."""
     found = set()
     while (end := _end_of(data, at)) is not None and data[at] == Opcode.MESSAGE_INDEX:
         if end < at + _HEAD.size + 2:

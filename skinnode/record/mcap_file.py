@@ -16,6 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skinnode.config import HandConfig
+from skinnode.host.events import HealthEvent
+from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.host.skeleton import Skeleton
 from skinnode.messages.can_frames import FrameEncoder
 from skinnode.messages.contacts import WRENCH, contact_wrenches, contacts_message
 from skinnode.messages.definitions import CAN_FRAME, CONTACTS, FD_FRAME, FIELD_INFO, JOURNAL_LINE
@@ -24,9 +27,6 @@ from skinnode.messages.health import DIAGNOSTIC_ARRAY, LOG, diagnostics, log_mes
 from skinnode.messages.poses import TRANSFORMS, transforms
 from skinnode.messages.topics import DIAGNOSTICS, TF_STATIC, HandTopics
 from skinnode.messages.typestore import encode, message_type, require_mcap, schema_text
-from skinnode.host.events import HealthEvent
-from skinnode.host.health import BusHealth, PatchHealth
-from skinnode.host.skeleton import Skeleton
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.transport.frame import Frame
@@ -159,7 +159,7 @@ class McapFile:
         self.flush(to_disk=False)
 
     def close(self) -> None:
-        """Write the index and close the file. Disk errors are ignored, as earlier calls have reported them."""
+        """Write the index and close the file. Disk errors are ignored: earlier calls have reported them."""
         with contextlib.suppress(OSError):
             self._writer.finish()
             self._file.flush()
@@ -195,7 +195,7 @@ class McapFile:
             schema = self._schemas[name] = self._writer.register_schema(name, "ros2msg", text)
         qos = _LATCHED if topic == TF_STATIC else ""
         metadata = {"offered_qos_profiles": qos, **metadata}
-        channel = self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, metadata)
+        channel: int = self._writer.register_channel(topic, "cdr", schema, metadata)
+        self._channels[topic] = channel
         self._sequence[channel] = 0
         return channel
-

@@ -84,9 +84,7 @@ class _Rows:
     def add(self, row: FieldRow) -> None:
         record = np.zeros((), dtype=self._record)
         for name, value in row.columns.items():
-            record[name] = (
-                self._texts.setdefault(value, len(self._texts)) if name in TEXTS else value
-            )
+            record[name] = self._texts.setdefault(value, len(self._texts)) if name in TEXTS else value
         self._file.write(record.tobytes())
         self._count += 1
 

@@ -25,8 +25,10 @@ def require_pyarrow(path: Path) -> None:
 
 
 class ParquetFile:
-    """New Parquet file of fields. Arrays are lists in row-major order; the columns ``upper_wires``,
-    ``upper_electrodes`` and ``lower_wires`` contain their dimensions U, N and K.
+    """New Parquet file of fields.
+
+    Arrays are lists in row-major order. The columns ``upper_wires``, ``upper_electrodes`` and ``lower_wires``
+    contain their dimensions U, N and K.
 
     Args:
         path: Path of the new file.

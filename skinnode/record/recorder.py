@@ -318,4 +318,3 @@ class Recorder:
     def _write_event(self, bus: str, t_ns: int, event: str, **more: Any) -> None:
         place = {"bus": bus, "at": self._at.get(bus, 0), "t_ns": t_ns, "event": event}
         self._file.write_line(json.dumps({**place, **more}), clock.monotonic_ns() + self._offset_ns)
-

@@ -127,6 +127,7 @@ class ReplayedBus:
         return self._solvers.get(patch)
 
     def stats(self) -> BusStats:
+        """Return the counters of the bus."""
         return self._dispatcher.count(PortCounters(sent=self._sent))
 
     def _is_due(self, event: dict[str, Any], t_ns: int, *, whole: bool) -> bool:

@@ -115,7 +115,8 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
     frames: Frames = McapReader(path) if path.suffix == MCAP else FrameLogReader(path)
     guests = tuple(bus.model_copy(update={"role": "guest"}) for bus in hand.buses)
     hand = hand.model_copy(update={"buses": guests})
-    events, notes = [], []
+    events: list[dict[str, Any]] = []
+    notes = []
     for patch in hand.patches:
         profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
         layout = patch.layout.build()

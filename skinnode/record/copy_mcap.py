@@ -47,7 +47,6 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
             name = "" if schema is None else schema.name
             counts[name] = counts.get(name, 0) + 1
         writer.finish()
-    chunks.close()
     faults = [f"{source.name} {damage}" for damage in chunks.damages]
     if chunks.damaged > len(faults):
         faults.append(f"{chunks.damaged - len(faults)} more damaged places")

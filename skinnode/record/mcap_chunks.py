@@ -44,7 +44,7 @@ class McapMessage:
 
 
 class McapChunks:
-    """Messages of an MCAP file in the order of the file.
+    """Messages of an MCAP file in the order of the file, which is open only while it is read.
 
     Args:
         path: The file.
@@ -56,15 +56,11 @@ class McapChunks:
 
     def __init__(self, path: Path, check: Callable[[Schema], None]) -> None:
         self.path, self._check = path, check
-        self._file = _open(path)
+        _open(path).close()
         self.damages: list[Damage] = []
         """First :data:`DAMAGES_KEPT` damaged parts of the file."""
         self.damaged = 0
         """Number of damaged parts found so far."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
     def messages(self, names: Collection[str] | None) -> Iterator[McapMessage]:
         """Yield the messages with some schemas; chunks that contain no such message are not decompressed.
@@ -82,7 +78,7 @@ class McapChunks:
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         self.damages, self.damaged = [], 0
-        with mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        with _open(self.path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             for record, indexed in self._records(data):
                 if indexed is not None and not any(map(wanted, indexed)):
                     continue

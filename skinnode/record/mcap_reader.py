@@ -56,8 +56,7 @@ class McapReader:
         return self._chunks.damaged
 
     def close(self) -> None:
-        """Stop reading and close the file."""
-        self._chunks.close()
+        """Do nothing: the file is open only while it is read."""
 
     def journal(self) -> Iterator[bytes]:
         """Yield the lines of the journal."""
@@ -76,7 +75,6 @@ class McapReader:
                 yield LoggedFrame(frame_of(item.message.data, item.schema.name), bus, sent)
             except ValueError as error:
                 self._chunks.complain(item.offset, f"a message that cannot be read ({error})")
-        self.close()
 
     def _check(self, schema: Schema) -> None:
         """Raise ConfigError if a message of ours has a newer version than this one."""

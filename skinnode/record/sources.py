@@ -82,7 +82,6 @@ def open_recording(path: Path) -> OpenRecording:
         reader = McapReader(path)
         raw = list(reader.journal())
         if not raw:
-            reader.close()
             allowed = "a recording of skinnode; for other MCAP files with CAN frames, also give --hand"
             raise ConfigError("recording", str(path), allowed)
         header, events, complaints = parse_journal(str(path), f"{path.name} journal", raw)

@@ -273,5 +273,7 @@ def test_an_empty_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("name", ["", ".", "/"])
 def test_what_has_no_name_is_no_recording(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"^recording: got '[./]', allowed: a file ending in .log, .blf, .asc or .mcap$"):
+    with pytest.raises(
+        ConfigError, match=r"^recording: got '[./]', allowed: a file ending in .log, .blf, .asc or .mcap$"
+    ):
         replay(name)

@@ -130,25 +130,26 @@ def read_npz(path: Path) -> tuple[str, Iterator[FieldRow]]:
     """
     allowed = "an NPZ file of fields written by skinnode convert"
     try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile) or _FORMAT_NAME not in file.files:
-            raise ConfigError("fields", str(path), allowed)
-        check_format(str(file[_FORMAT_NAME]), path)
-        return str(file[_HAND_NAME]), _rows(file, path)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, ConfigError):
-            raise
+        with path.open("rb") as opened:
+            file = np.load(opened, allow_pickle=False)
+            if not isinstance(file, np.lib.npyio.NpzFile) or _FORMAT_NAME not in file.files:
+                raise ConfigError("fields", str(path), allowed)
+            check_format(str(file[_FORMAT_NAME]), path)
+            return str(file[_HAND_NAME]), _rows(path)
+    except ConfigError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         raise ConfigError("fields", str(path), allowed) from None
 
 
-def _rows(file: Any, path: Path) -> Iterator[FieldRow]:
-    patches = [name.removesuffix("/scan") for name in file.files if name.endswith("/scan")]
+def _rows(path: Path) -> Iterator[FieldRow]:
     try:
-        for patch in patches:
-            columns = {name: file[f"{patch}/{name}"] for name in _COLUMNS}
-            for i in range(len(columns["scan"])):
-                values = {name: column[i] for name, column in columns.items()}
-                yield FieldRow(patch, values | {name: str(values[name]) for name in TEXTS})
+        with np.load(path, allow_pickle=False) as file:
+            for patch in [name.removesuffix("/scan") for name in file.files if name.endswith("/scan")]:
+                columns = {name: file[f"{patch}/{name}"] for name in _COLUMNS}
+                for i in range(len(columns["scan"])):
+                    values = {name: column[i] for name, column in columns.items()}
+                    yield FieldRow(patch, values | {name: str(values[name]) for name in TEXTS})
     except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
         reason = " ".join(str(error).split())[:100]
         raise ConfigError("fields", str(path), f"an undamaged NPZ file ({reason})") from None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
 import random
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -23,6 +25,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from typer.testing import CliRunner
+from zstandard import ZstdError
 
 from skinnode.cli.main import app
 from skinnode.config import HandConfig
@@ -253,6 +256,15 @@ def numbers_in(path: Path) -> tuple[list[int], int]:
     return [int.from_bytes(g.frame.data, "little") for g in reader], reader.damaged
 
 
+def read_by_the_library(path: Path) -> int:
+    """How many messages mcap's own reader gives before it stops at the cut."""
+    messages = 0
+    with path.open("rb") as file, contextlib.suppress(EndOfFile, ZstdError, struct.error, ValueError):
+        for record in StreamReader(file).records:
+            messages += isinstance(record, Message)
+    return messages
+
+
 def test_a_file_cut_anywhere_gives_every_whole_chunk(tmp_path: Path) -> None:
     whole, path = written(tmp_path / "x.mcap", 500), tmp_path / "cut.mcap"
     rng = random.Random(3)
@@ -265,14 +277,7 @@ def test_a_file_cut_anywhere_gives_every_whole_chunk(tmp_path: Path) -> None:
         assert len(numbers) % 50 == 0
         assert len(numbers) >= before  # a longer file never gives less
         before = len(numbers)
-        with path.open("rb") as file:
-            theirs = 0
-            try:
-                for record in StreamReader(file).records:
-                    theirs += isinstance(record, Message)
-            except Exception:  # the library's reader stops at the cut
-                pass
-        assert len(numbers) == max(theirs - 1, 0)  # one message is the journal's
+        assert len(numbers) == max(read_by_the_library(path) - 1, 0)  # one message is the journal's
     assert before == 500
 
 
@@ -296,6 +301,7 @@ def test_garbage_costs_the_chunks_that_it_covers(tmp_path: Path) -> None:
 
 def test_whatever_is_in_a_file_nothing_but_one_line_is_raised(tmp_path: Path) -> None:
     whole, path = written(tmp_path / "x.mcap", 120, 30), tmp_path / "y.mcap"
+    refusals: list[str] = []
     for seed in range(150):
         rng, content = random.Random(seed), bytearray(whole)
         for _ in range(rng.randint(1, 6)):
@@ -307,7 +313,8 @@ def test_whatever_is_in_a_file_nothing_but_one_line_is_raised(tmp_path: Path) ->
             assert list(run) == []
             assert len(run.flaws) > 0  # not ended properly, at least
         except ConfigError as error:
-            assert "\n" not in str(error)
+            refusals.append(str(error))
+    assert not any("\n" in line for line in refusals)
 
 
 def test_a_chunk_that_claims_little_and_contains_much_is_refused(tmp_path: Path) -> None:
@@ -419,10 +426,7 @@ def test_killed_twenty_times_it_reads_up_to_the_last_second(tmp_path: Path) -> N
         assert numbers == list(range(len(numbers)))
         due = [int(each[0]) for each in told[:-1] if len(each) == 2 and int(each[1]) < killed_ns - 10**9]
         assert len(numbers) > max(due, default=-1)
-        theirs = 0
-        with path.open("rb") as file, pytest.raises(EndOfFile):  # the library reads up to the cut, and raises
-            for record in StreamReader(file).records:
-                theirs += isinstance(record, Message)
+        theirs = read_by_the_library(path)
         assert theirs == len(numbers) + 1
         done = CliRunner().invoke(app, ["convert", str(path), str(repaired)])
         assert done.exit_code == int(damaged > 0), done.output

@@ -432,3 +432,68 @@ def test_killed_twenty_times_it_reads_up_to_the_last_second(tmp_path: Path) -> N
         assert done.exit_code == int(damaged > 0), done.output
         with AnyReader([repaired]) as bag:
             assert bag.message_count == theirs
+
+
+def test_readers_that_need_the_index_refuse_a_killed_file_and_take_the_repaired_one(tmp_path: Path) -> None:
+    whole, path, repaired = written(tmp_path / "x.mcap", 500), tmp_path / "cut.mcap", tmp_path / "good.mcap"
+    path.write_bytes(whole[: whole.rindex(b"zstd") - 41])  # as if killed after a flush
+    with path.open("rb") as file, pytest.raises(Exception):  # noqa: B017, PT011 - whatever its bytes look like
+        list(make_reader(file).iter_messages())
+    with pytest.raises(Exception, match="File end magic is invalid"), AnyReader([path]):
+        pass
+    done = CliRunner().invoke(app, ["convert", str(path), str(repaired)])
+    assert done.exit_code == 0, done.output
+    with repaired.open("rb") as file:
+        assert len(list(make_reader(file).iter_messages())) == len(numbers_in(path)[0]) + 1
+    with AnyReader([repaired]) as bag:
+        assert bag.message_count == len(numbers_in(path)[0]) + 1
+
+
+HOST = """
+import sys, time
+from skinnode.config import load_hand
+from skinnode.host import Host
+from skinnode.record import Recorder, followed
+from vcan_sim.fleet import Fleet
+hand = load_hand(sys.argv[1])
+with Fleet(hand), Recorder(hand, sys.argv[2]) as recorder, Host.from_config(hand, tap=recorder) as host:
+    with followed(recorder, host):
+        print("go", flush=True)
+        for field in host.fields():
+            print(field.stamp.patch, field.stamp.scan, time.monotonic_ns(), flush=True)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_a_killed_host_leaves_the_fields_up_to_the_last_second(tmp_path: Path) -> None:
+    hand = tmp_path / "hand.toml"
+    sizes = "upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4"
+    hand.write_text(
+        '[[buses]]\nname = "can0"\ninterface = "virtual"\n[sync]\nperiod_ms = 50\n'
+        f'[[patches]]\nname = "p0"\nnode_id = 5\nlayout = {{ {sizes} }}\n'
+    )
+    for attempt in range(5):
+        path, repaired = tmp_path / f"run{attempt}.mcap", tmp_path / f"repaired{attempt}.mcap"
+        arguments = [sys.executable, "-c", HOST, str(hand), str(path)]
+        with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "go\n"
+            time.sleep(random.Random(attempt).uniform(1.0, 3.0))
+            child.send_signal(signal.SIGKILL)
+            killed_ns = time.monotonic_ns()
+            told = [line.split() for line in child.stdout.read().splitlines()]
+        done = CliRunner().invoke(app, ["convert", str(path), str(repaired)])
+        assert done.exit_code in (0, 1), done.output
+        scans = set()
+        with AnyReader([repaired]) as bag:
+            for connection, _, raw in bag.messages():
+                if connection.msgtype == "skinnode_msgs/msg/FieldInfo":
+                    message: Any = bag.deserialize(raw, connection.msgtype)
+                    scans.add((message.patch, message.scan))
+        due = {(each[0], int(each[1])) for each in told[:-1] if int(each[2]) < killed_ns - 10**9}
+        assert due
+        assert due <= scans
+        run = replay(path)
+        assert {key(field) for field in run} >= due
+        assert any("not ended properly" in flaw for flaw in run.flaws)

@@ -62,11 +62,13 @@ class McapChunks:
         self.damaged = 0
         """Number of damaged parts found so far."""
 
-    def messages(self, names: Collection[str] | None) -> Iterator[McapMessage]:
-        """Yield the messages with some schemas; chunks that contain no such message are not decompressed.
+    def messages(self, names: Collection[str] | None, *, by_index: bool = False) -> Iterator[McapMessage]:
+        """Yield the messages with some schemas.
 
         Args:
             names: Names of the schemas; None for all messages.
+            by_index: Whether to skip chunks that contain no such message according to their index. This
+                requires that the first message on each topic is in the chunk that defines the topic.
         """
 
         def wanted(channel: int) -> bool:
@@ -79,21 +81,15 @@ class McapChunks:
         channels: dict[int, Channel] = {}
         self.damages, self.damaged = [], 0
         with _open(self.path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            for record, indexed in self._records(data):
-                if indexed is not None and not any(map(wanted, indexed)):
-                    continue
-                offset, content = record
-                for item in self._content(content, offset):
-                    if isinstance(item, Schema):
-                        self._check(item)
-                        schemas[item.id] = item
-                    elif isinstance(item, Channel):
-                        channels[item.id] = item
-                    elif (
-                        isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id)
-                    ):
-                        channel = channels[item.channel_id]
-                        yield McapMessage(item, channel, schemas.get(channel.schema_id), offset)
+            for offset, item in self._records(data, wanted if by_index else None):
+                if isinstance(item, Schema):
+                    self._check(item)
+                    schemas[item.id] = item
+                elif isinstance(item, Channel):
+                    channels[item.id] = item
+                elif isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id):
+                    channel = channels[item.channel_id]
+                    yield McapMessage(item, channel, schemas.get(channel.schema_id), offset)
 
     def complain(self, offset: int, what: str) -> None:
         """Record a damaged part of the file."""
@@ -101,42 +97,54 @@ class McapChunks:
         if len(self.damages) < DAMAGES_KEPT:
             self.damages.append(Damage(None, offset, what))
 
-    def _content(self, record: McapRecord, offset: int) -> list[McapRecord]:
-        """Return the records in a chunk, or the record itself if it is not a chunk."""
-        if not isinstance(record, Chunk):
-            return [record]
-        try:
-            content: list[McapRecord] = breakup_chunk(_decompressed(record), validate_crc=True)
-            return content
-        except Exception as error:  # the decompressors and the library raise various exceptions
-            self.complain(offset, f"a chunk that cannot be read ({type(error).__name__}: {error})")
-            return []
+    def _records(
+        self, data: mmap.mmap, wanted: Callable[[int], bool] | None
+    ) -> Iterator[tuple[int, McapRecord]]:
+        """Yield the records of all chunks, each with the offset of its chunk.
 
-    def _records(self, data: mmap.mmap) -> Iterator[tuple[tuple[int, McapRecord], frozenset[int] | None]]:
-        """Yield each chunk, schema, channel and message with its offset.
-
-        The second item contains the numbers of the channels that have messages in a chunk; None if unknown.
+        A damaged length may point beyond intact chunks. A chunk whose checksum is right has the right length.
+        After any other record, the next record must be plausible, or no intact chunk may follow.
         """
         at, size = len(MAGIC), len(data)
         while at < size:
-            end = _end_of(data, at)
-            opcode = data[at]
-            if opcode in _AT_THE_END and end is not None:
-                return
-            if end is None:
-                following = _find_chunk(data, at + 1)
-                self.complain(at, "truncated" if following == size else "no record")
-                at = following
-                continue
-            if opcode in (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-                try:
-                    record = _parsed(opcode, data[at + _HEAD.size : end])
-                except Exception as error:  # the library raises various exceptions for invalid data
-                    self.complain(at, f"a record that cannot be read ({type(error).__name__}: {error})")
-                    at = _find_chunk(data, at + 1)
+            opcode, end = data[at], _end_of(data, at)
+            if opcode == Opcode.CHUNK and end is not None:
+                index = None if wanted is None else _indexed(data, end)
+                if wanted is not None and index is not None and not any(map(wanted, index)):
+                    at = end
                     continue
-                yield (at, record), _indexed(data, end) if opcode == Opcode.CHUNK else None
-            at = end
+                content = self._read(data, at, end)
+                if content is not None:
+                    yield from ((at, item) for item in content)
+                    at = end
+                    continue
+            elif end is not None and (
+                (opcode not in _AT_THE_END and _is_plausible(data, end)) or _find_chunk(data, at + 1) == size
+            ):
+                if opcode in _AT_THE_END:
+                    return
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                    yield from ((at, item) for item in self._read(data, at, end) or ())
+                at = end
+                continue
+            following = _find_chunk(data, at + 1)
+            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage has been recorded
+                self.complain(at, "truncated" if following == size else "no record")
+            at = following
+
+    def _read(self, data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:
+        """Return the records in a chunk, or a record that is not in a chunk; None if it cannot be read."""
+        try:
+            record = _parsed(data[at], data[at + _HEAD.size : end])
+            if not isinstance(record, Chunk):
+                return [record]
+            if end - at != _HEAD.size + _CHUNK_HEAD.size + len(record.compression) + 8 + len(record.data):
+                raise ValueError("wrong length")
+            content: list[McapRecord] = breakup_chunk(_decompressed(record), validate_crc=True)
+        except Exception as error:  # the decompressors and the library raise various exceptions
+            self.complain(at, f"a record that cannot be read ({type(error).__name__}: {error})")
+            return None
+        return content
 
 
 def _open(path: Path) -> BinaryIO:
@@ -177,6 +185,11 @@ def _end_of(data: mmap.mmap, at: int) -> int | None:
     known = 0 < opcode <= Opcode.DATA_END or opcode >= 0x80  # 0x80 and above are private records
     end = int(at + _HEAD.size + length)
     return end if known and end <= len(data) else None
+
+
+def _is_plausible(data: mmap.mmap, at: int) -> bool:
+    """Return whether the file ends at ``at``, or a complete record begins there."""
+    return at == len(data) or _end_of(data, at) is not None
 
 
 def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:

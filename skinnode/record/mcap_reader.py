@@ -60,7 +60,7 @@ class McapReader:
 
     def journal(self) -> Iterator[bytes]:
         """Yield the lines of the journal."""
-        for item in self._chunks.messages((JOURNAL_LINE,)):
+        for item in self._chunks.messages((JOURNAL_LINE,), by_index=True):
             try:
                 line: str = decode(item.message.data, JOURNAL_LINE).json
             except ValueError as error:

@@ -157,7 +157,12 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
     "replay": lambda place: [[place.missing], [place.file("evil.log", f"(1.0) {EVIL} 123#00\n")]],
     "convert": lambda place: [
         [place.missing, WORSE],
-        [place.file("evil.log", f"(1.0) {EVIL} 123#00\n"), str(place.folder / "x.npz"), "--hand", place.hand()],
+        [
+            place.file("evil.log", f"(1.0) {EVIL} 123#00\n"),
+            str(place.folder / "x.npz"),
+            "--hand",
+            place.hand(),
+        ],
     ],
     "conformance": lambda place: [
         [

@@ -197,8 +197,7 @@ class _Tee:
     """Frames of a recording, which are written to a file while they are read."""
 
     def __init__(self, recording: OpenRecording, file: LogFiles | McapFile) -> None:
-        self._frames, self._file, self._bus_of = recording.frames, file, recording.bus_of
-        self._only = recording.header.hand.buses[0].name if len(recording.header.hand.buses) == 1 else None
+        self._frames, self._file, self._channels = recording.frames, file, recording.channels
         self.path = recording.frames.path
         self.errors = 0
         """Number of error frames."""
@@ -213,7 +212,7 @@ class _Tee:
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         for number, logged in enumerate(self._frames, 1):
-            frame, bus = logged.frame, self._bus_of.get(logged.channel, self._only)
+            frame, bus = logged.frame, self._channels.bus(logged.channel)
             if bus is not None:
                 self._file.write(bus, frame, sent=logged.sent, log_ns=frame.t_ns)
                 self.errors += frame.error

@@ -127,7 +127,7 @@ class Replay:
             bus.name: ReplayedBus(bus, self, [event for event in events if event["bus"] == bus.name])
             for bus in self.hand.buses
         }
-        self._by_channel = {channel: self._buses[bus] for channel, bus in recording.bus_of.items()}
+        self._channels = recording.channels
         self.foreign = recording.foreign
         self.resistances: deque[ResistanceFrame] | None = deque() if keep_resistances else None
         """Resistances of the solved scans in order, NaN where they were not used; the caller removes them.
@@ -138,11 +138,11 @@ class Replay:
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
         for frame, channel, sent in self.frames():
-            bus = self._by_channel.get(channel) or self._only_bus(channel)
-            if bus is None:
+            name = self._channels.bus(channel)
+            if name is None:
                 self.strange += 1
                 continue
-            bus.take(frame, sent=sent, whole=not (self.log.damaged or self.foreign))
+            self._buses[name].take(frame, sent=sent, whole=not (self.log.damaged or self.foreign))
             while (field := fields.get(0.0)) is not None:
                 yield field
         for bus in self._buses.values():
@@ -169,14 +169,6 @@ class Replay:
         self.log.close()
         if not self.stopped:
             self.incomplete = self._lack()
-
-    def _only_bus(self, channel: str) -> ReplayedBus | None:
-        """Assign the first unknown channel of a foreign log to the bus of the hand if there is only one."""
-        if not self.foreign or len(self._buses) != 1 or self._read > 1:
-            return None
-        (bus,) = self._buses.values()
-        self._by_channel = {channel: bus}
-        return bus
 
     def _lack(self) -> str | None:
         if self.foreign:

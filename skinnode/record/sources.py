@@ -46,6 +46,26 @@ class Frames(Protocol):
         """Close the file."""
 
 
+class ChannelMap:
+    """Buses of the channels in a file.
+
+    Args:
+        bus_of: Name of the bus of each channel.
+        only: If the first frame is on an unknown channel, its channel belongs to this bus, and no other
+            channel to any bus; None for no such rule.
+    """
+
+    def __init__(self, bus_of: dict[str, str], only: str | None = None) -> None:
+        self._bus_of, self._only = bus_of, only
+
+    def bus(self, channel: str) -> str | None:
+        """Return the name of the bus of a channel; None if the channel belongs to no bus of the hand."""
+        only, self._only = self._only, None
+        if only is not None and channel not in self._bus_of:
+            self._bus_of = {channel: only}
+        return self._bus_of.get(channel)
+
+
 @dataclass(frozen=True, slots=True)
 class OpenRecording:
     """Frames and journal of an open recording."""
@@ -59,8 +79,7 @@ class OpenRecording:
     """Lines of the journal; empty if there is none."""
     journal: str
     """Name of the file that contains the journal."""
-    bus_of: dict[str, str]
-    """Name of the bus of each channel in the file."""
+    channels: ChannelMap
     foreign: bool = False
     """Whether there is no journal, so that the header and the events were made from a hand file."""
     notes: tuple[str, ...] = ()
@@ -93,7 +112,7 @@ def open_recording(path: Path) -> OpenRecording:
         frames = FrameLogReader(path)
         name, buses = journal.name, _channels_in(path, header.hand)
     lines = [line.decode("utf-8", "replace").rstrip("\n") for line in raw]
-    return OpenRecording(frames, header, events, complaints, lines, name, buses)
+    return OpenRecording(frames, header, events, complaints, lines, name, ChannelMap(buses))
 
 
 def open_log(path: Path, hand: HandConfig) -> OpenRecording:
@@ -141,7 +160,15 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
     if path.suffix != ".blf":
         buses = {bus.channel: bus.name for bus in hand.buses} | {b.name: b.name for b in hand.buses} | buses
     return OpenRecording(
-        frames, Header(hand, "", 0), events, [], [], "hand file", buses, foreign=True, notes=tuple(notes)
+        frames=frames,
+        header=Header(hand, "", 0),
+        events=events,
+        complaints=[],
+        lines=[],
+        journal="hand file",
+        channels=ChannelMap(buses, hand.buses[0].name if len(hand.buses) == 1 else None),
+        foreign=True,
+        notes=tuple(notes),
     )
 
 

@@ -24,14 +24,16 @@ from skinnode.transport.frame_log_reader import Damage
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
+_RECEIVED_TOPICS = ("from_can_bus", "from_can_bus_fd")
 _SENT_TOPICS = ("to_can_bus", "to_can_bus_fd")
-"""Last part of the topics on which ros2_socketcan sends frames."""
+"""Last part of the topics of ros2_socketcan."""
 
 
 class McapReader:
     """Iterable over the CAN frames of an MCAP file. Frames have the name of their bus as channel.
 
-    A frame on a topic without the name of a bus has the topic as channel.
+    Without the name of a bus, the channel is the namespace of the topics of ros2_socketcan, such as ``can0``
+    of ``/can0/from_can_bus``, or otherwise the topic.
 
     Raises:
         ConfigError: The file cannot be read, is not an MCAP file, or contains a newer version of our
@@ -89,7 +91,8 @@ class McapReader:
 
 def _bus_of(channel: Channel) -> tuple[str, bool]:
     """Return the bus of a channel's frames, and whether the recording program sent them."""
-    bus = channel.metadata.get(BUS_KEY)
-    sent = channel.metadata.get(SENT_KEY)
-    last = channel.topic.rpartition("/")[2]
-    return bus or channel.topic, last in _SENT_TOPICS if sent is None else sent == "1"
+    bus, sent = channel.metadata.get(BUS_KEY), channel.metadata.get(SENT_KEY)
+    parent, _, last = channel.topic.rpartition("/")
+    if bus is None:
+        bus = (parent.strip("/") or "/") if last in (*_RECEIVED_TOPICS, *_SENT_TOPICS) else channel.topic
+    return bus, last in _SENT_TOPICS if sent is None else sent == "1"

@@ -221,7 +221,7 @@ def test_can_frames_of_a_bag_that_another_program_recorded(tmp_path: Path) -> No
         writer = Writer(file, use_chunking=False, compression=CompressionType.NONE)
         writer.start("ros2")
         schema = writer.register_schema("can_msgs/msg/Frame", "ros2msg", b"")
-        for number, topic in enumerate(("/from_can_bus", "/to_can_bus")):
+        for number, topic in enumerate(("/can3/from_can_bus", "/can3/to_can_bus", "/other")):
             channel = writer.register_channel(topic, "cdr", schema)
             data = bytes.fromhex(
                 "00010000 01000000 02000000 05000000 63616e30 00000000 85010000 00000008 0102030405060708"
@@ -229,7 +229,7 @@ def test_can_frames_of_a_bag_that_another_program_recorded(tmp_path: Path) -> No
             writer.add_message(channel, number, data, number)
         writer.finish()
     frame = Frame(0x185, bytes(range(1, 9)), 1_000_000_002)
-    assert list(McapReader(path)) == [(frame, "/from_can_bus", False), (frame, "/to_can_bus", True)]
+    assert list(McapReader(path)) == [(frame, "can3", False), (frame, "can3", True), (frame, "/other", False)]
     with pytest.raises(ConfigError, match=r"a recording of skinnode; for other MCAP files .* give --hand"):
         replay(path)
 

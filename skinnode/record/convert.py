@@ -26,7 +26,7 @@ from skinnode.record.npz_file import NpzFile, read_npz
 from skinnode.record.parquet_file import ParquetFile, read_parquet
 from skinnode.record.replay import Replay
 from skinnode.record.sources import FRAME_FILES, Frames, OpenRecording, open_log, open_recording
-from skinnode.transport.frame_log import LoggedFrame
+from skinnode.transport.frame_log import WRITABLE, LoggedFrame
 from skinnode.transport.frame_log_reader import Damage
 
 PARQUET, NPZ = ".parquet", ".npz"
@@ -76,7 +76,7 @@ def convert(
         ConfigError: The source cannot be read, the target exists or cannot be written, there is no such
             conversion, or the packages for a format are not installed.
     """
-    _check(source, target, hand)
+    taken = _check(source, target, hand)
     try:
         if source.suffix in TABLES:
             return _copy_table(source, target)
@@ -88,14 +88,13 @@ def convert(
         return _copy_frames(recording, target, fields=target.suffix == MCAP and not frames_only)
     except BaseException:
         with suppress(OSError):
-            target.unlink(missing_ok=True)
-            if target.suffix in FRAME_FILES[:-1]:
-                target.with_suffix(SUFFIX).unlink(missing_ok=True)
+            for path in taken:
+                path.unlink(missing_ok=True)
         raise
 
 
-def _check(source: Path, target: Path, hand: HandConfig | None) -> None:
-    """Raise ConfigError if there is no such conversion, or if the target exists."""
+def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
+    """Return the files to create. Raises ConfigError if there is no such conversion, or if a file exists."""
     if source.suffix not in TARGETS:
         raise ConfigError("source", str(source), _ending_in(TARGETS))
     allowed = TABLES if source.suffix in TABLES else TARGETS
@@ -104,12 +103,22 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> None:
         raise ConfigError("target", str(target), _ending_in(allowed) + why)
     if source.suffix in TABLES and hand is not None:
         raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
-    taken = [target, target.with_suffix(SUFFIX)] if target.suffix in FRAME_FILES[:-1] else [target]
+    taken = [target]
+    if target.suffix in WRITABLE and not _share_journal(source, target):
+        taken.append(target.with_suffix(SUFFIX))
     for path in taken:
         if path.exists():
             raise ConfigError("target", str(path), "a new file; this one exists and is not overwritten")
     if not target.parent.is_dir():
         raise ConfigError("target", str(target), "a file in an existing folder")
+    return taken
+
+
+def _share_journal(source: Path, target: Path) -> bool:
+    """Return whether both files are logs of the same name in the same folder, which have the same journal."""
+    return {source.suffix, target.suffix} <= set(WRITABLE) and source.with_suffix("") == target.with_suffix(
+        ""
+    )
 
 
 def _ending_in(suffixes: tuple[str, ...]) -> str:
@@ -166,7 +175,11 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
     file = (
         McapFile(target, hand)
         if target.suffix == MCAP
-        else LogFiles(target, hand, journal=not recording.foreign)
+        else LogFiles(
+            target,
+            hand,
+            journal=not (recording.foreign or _share_journal(recording.frames.path, target)),
+        )
     )
     offset_ns = recording.header.wall_minus_mono_ns
     for number, line in enumerate(recording.lines):

@@ -58,6 +58,23 @@ def test_a_recording_comes_back_byte_for_byte(recorded: Path, tmp_path: Path, th
     assert bits(middle) == bits(recorded)
 
 
+def test_a_log_next_to_its_source_shares_the_journal(recorded: Path, tmp_path: Path) -> None:
+    source = tmp_path / "run.log"
+    for suffix in (".log", ".jsonl"):
+        source.with_suffix(suffix).write_bytes(recorded.with_suffix(suffix).read_bytes())
+    convert(source, tmp_path / "run.blf")
+    assert bits(tmp_path / "run.blf") == bits(recorded)
+    with pytest.raises(ConfigError, match="exists"):
+        convert(source, tmp_path / "run.blf")
+    assert source.with_suffix(".jsonl").read_bytes() == recorded.with_suffix(".jsonl").read_bytes()
+    (tmp_path / "x.log").write_text("(1.000000) can0 185#00 R\n")
+    (tmp_path / "x.jsonl").write_text("no journal\n")
+    with pytest.raises(ConfigError, match="the header of a recording's journal"):
+        convert(tmp_path / "x.log", tmp_path / "x.blf")
+    assert (tmp_path / "x.jsonl").exists()
+    assert not (tmp_path / "x.blf").exists()
+
+
 def test_frames_of_every_kind_survive_each_format(tmp_path: Path) -> None:
     """Error frames lose their content in ASC, which says so."""
     hand, source = a_hand(), tmp_path / "run.log"

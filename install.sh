@@ -2,6 +2,8 @@
 # install.sh [EXTRA]: make the virtual environment .venv beside this file and install skinnode into it.
 #   sh install.sh          what a robot needs, and plots
 #   sh install.sh tui      what a robot needs, and the full screen of skinnode monitor
+#   sh install.sh mcap     what a robot needs, and recordings as MCAP
+#   sh install.sh parquet  what a robot needs, and tables of fields as Parquet
 #   sh install.sh bench    what a robot needs, and Ceres to measure against
 #   sh install.sh test     the first, editable, with everything the tests use
 # Needs Python 3.11 or newer (PYTHON=... chooses one). On a Debian without the venv module it installs that first.
@@ -10,8 +12,8 @@ cd "$(dirname "$0")"
 python=${PYTHON:-python3}
 extra=${1:-plot}
 case $extra in
-    plot | tui | bench | test) ;;
-    *) echo "install.sh: got $extra, allowed: plot, tui, bench or test" >&2; exit 2 ;;
+    plot | tui | mcap | parquet | bench | test) ;;
+    *) echo "install.sh: got $extra, allowed: plot, tui, mcap, parquet, bench or test" >&2; exit 2 ;;
 esac
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
@@ -30,5 +32,5 @@ if [ ! -x .venv/bin/pip ]; then
 fi
 case $extra in
     test) .venv/bin/pip install --quiet --editable '.[test]' ;;
-    plot | tui | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
+    plot | tui | mcap | parquet | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
 esac

@@ -95,7 +95,7 @@ def run(  # noqa: PLR0913 - the options of the command
         for fd, touched, stagger_ms in SCENES:
             if (short and not touched) or ((fd or stagger_ms) and interface == "socketcan"):
                 continue
-            hand = _hand(fullest, fd, stagger_ms, interface, channel, Path(folder), one_worker=apart)
+            hand = full_hand(fullest, fd, stagger_ms, interface, channel, Path(folder), one_worker=apart)
             plain = touched and not (fd or short or stagger_ms)
             fewer = [buses for buses in (1, 2) if buses < fullest and plain]
             core = cores[-1] if apart else None
@@ -111,7 +111,7 @@ def run(  # noqa: PLR0913 - the options of the command
     return {"machine": machine() | {"road": road, "": where}, "rows": rows, "must": _must(rows)}
 
 
-def _hand(  # noqa: PLR0913 - the properties in which hands differ
+def full_hand(  # noqa: PLR0913 - the properties in which hands differ
     buses: int,
     fd: bool,
     stagger_ms: float,
@@ -121,6 +121,17 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
     *,
     one_worker: bool,
 ) -> HandConfig:
+    """Return a hand whose buses are fully loaded with four patches each.
+
+    Args:
+        buses: Number of buses.
+        fd: Whether the patches send CAN FD frames.
+        stagger_ms: Offset between the SYNCs of successive buses, ms.
+        interface: ``udp`` or ``socketcan``.
+        channel: Channel of the ``socketcan`` interface.
+        folder: Folder for the baseline file.
+        one_worker: Whether the host solves with one thread.
+    """
     listed = [
         {
             "name": f"can{i}",

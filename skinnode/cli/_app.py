@@ -9,6 +9,7 @@ import typer
 from skinnode.cli import (
     bench,
     conformance,
+    convert,
     demo,
     doctor,
     eds,
@@ -49,6 +50,7 @@ app.command(name="monitor")(monitor.monitor)
 app.command(name="doctor")(doctor.doctor)
 app.command(name="record")(record.record)
 app.command(name="replay")(replay.replay)
+app.command(name="convert")(convert.convert)
 app.command(name="conformance")(conformance.conformance)
 app.add_typer(bench.app, name="bench")
 

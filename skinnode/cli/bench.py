@@ -394,6 +394,45 @@ def pipeline(
 
 
 @app.command()
+def recording(
+    json: JsonFile = None,
+    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of full buses, four patches each.")] = 4,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of each recording in minutes.")] = 1.0,
+    block: Annotated[
+        float, typer.Option(min=1, help="Duration of the simulated traffic, which is repeated, s.")
+    ] = 5.0,
+) -> None:
+    """Write recordings of fully loaded buses; measure size, write cost and seek time of an MCAP file."""
+    from skinnode.bench import recording as bench
+    from skinnode.messages.typestore import require_mcap
+
+    require_mcap("skinnode bench recording")
+    _prepare(json)
+    typer.echo(
+        f"{'format':18}{'GB/hour':>9}{'µs per frame':>14}{'µs per field':>14}"
+        f"{'ms per flush':>14}{'of a core':>11}"
+    )
+
+    def report(row: dict[str, Any]) -> None:
+        field_us = "-" if row["field_us"] is None else f"{row['field_us']:.0f}"
+        typer.echo(
+            f"{row['format']:18}{row['gb_per_hour']:9.2f}{row['frame_us']:14.1f}{field_us:>14}"
+            f"{row['flush_ms']:14.2f}{row['core']:10.1%}"
+        )
+
+    figures = bench.run(buses, minutes, block, report)
+    rates, seek = figures["rates"], figures["seek"]
+    typer.echo(
+        f"{rates['frames_hz']:.0f} frames/s, {rates['fields_hz']:.0f} fields/s, "
+        f"{rates['minutes']:.1f} minutes\n"
+        f"MCAP with fields: opened in {seek['open_s']:.2f} s, seek {seek['seek_ms']:.0f} ms "
+        f"(median of {bench.SEEKS}, at most {seek['seek_max_ms']:.0f} ms), {seek['chunks']} chunks"
+    )
+    _print_machine(figures)
+    _write(json, figures)
+
+
+@app.command()
 def soak(
     json: JsonFile = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak test in minutes.")] = 10.0,

@@ -27,17 +27,17 @@ def record(
         typer.Option(
             "--output",
             "-o",
-            help="A new file ending in .log or .blf; or a folder, created if needed, for a file named after "
-            "the hand, the date and the time. Existing files are never overwritten.",
+            help="A new file ending in .log, .blf or .mcap; or a folder, created if needed, for a file named "
+            "after the hand, the date and the time. Existing files are never overwritten.",
             metavar="FOLDER|FILE",
         ),
     ],
     kind: Annotated[
-        Literal["log", "blf"],
+        Literal["log", "blf", "mcap"],
         typer.Option(
             "--format",
-            help="Format of a new file in a folder: candump text or Vector BLF.",
-            metavar="log|blf",
+            help="Format of a new file in a folder: candump text, Vector BLF or MCAP.",
+            metavar="log|blf|mcap",
         ),
     ] = "log",
     listen: Annotated[
@@ -51,7 +51,8 @@ def record(
 ) -> None:
     """Run a hand's patches as `skinnode host` does, and record every frame received or sent.
 
-    Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command is
+    Play the recording with `skinnode replay`; can-utils and python-can can read it too. An MCAP file also
+    contains the fields, contacts, health and events as ROS 2 messages. If the command is
     killed, at most the last second of the recording is lost. A recording made with --listen contains no
     baselines and can therefore be used only with CAN tools, not to compute fields. The exit status is 1 if
     frames could not be written or a fault occurred that `skinnode host` reports, 2 if the hand could not be
@@ -66,10 +67,13 @@ def record(
         _say(as_json, file=str(recorder.path))
         faults = (_listen if listen else _run)(plan, recorder, stop, seconds, as_json)
     stats = recorder.stats()
-    _say(as_json, frames=stats.frames, dropped=stats.dropped, failure=stats.failure)
+    counts = {"frames": stats.frames, "dropped": stats.dropped, "failure": stats.failure}
+    if recorder.records_fields and not listen:
+        counts |= {"fields": stats.fields, "fields_dropped": stats.fields_dropped}
+    _say(as_json, **counts)
     for fault in faults:
         _say(as_json, note=f"fault: {fault}")
-    if stats.dropped or stats.failure or faults:
+    if stats.dropped or stats.fields_dropped or stats.failure or faults:
         raise typer.Exit(1)
 
 
@@ -80,6 +84,7 @@ def _run(
     from skinnode.cli._host_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.scan_solver import check_solvable
+    from skinnode.record import followed
 
     for patch in plan.patches:
         check_solvable(patch, plan.solver)
@@ -87,7 +92,7 @@ def _run(
         with Host.from_config(plan, cancelled=stop.is_set, tap=recorder) as running:
             patches = counted(len(plan.patches), "patch", "patches")
             _say(as_json, note=f"{patches} operational; press Ctrl-C to stop")
-            with running.fields(capacity=1) as fields:
+            with followed(recorder, running), running.fields(capacity=1) as fields:
                 _follow(recorder, stop, seconds, as_json, lambda: fields.get(0.0))
             faults, notes = faults_and_notes(running)
             for note in notes:

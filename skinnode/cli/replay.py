@@ -17,10 +17,19 @@ def replay(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="The .log or .blf file of the recording; the .jsonl file must be in the same folder.",
+            help="The .mcap, .log, .blf or .asc file of the recording. The journal (.jsonl) of a file other "
+            "than .mcap must be in the same folder.",
             metavar="RECORDING",
         ),
     ],
+    hand: Annotated[
+        Path | None,
+        typer.Option(
+            "--hand",
+            help="Hand file for a log without a journal, such as a candump log of another master.",
+            metavar="HAND.toml",
+        ),
+    ] = None,
     speed: Annotated[
         float, typer.Option(help="Playback speed: 1 is as recorded, 2 is twice as fast.", metavar="X")
     ] = 1.0,
@@ -34,6 +43,9 @@ def replay(
 ) -> None:
     """Decode and solve a recording made by `skinnode record`; results are bit-identical to the live run's.
 
+    With --hand, decode a log that another program recorded. Its scans are solved with the layouts and
+    baselines of the hand file, and the first scans may lack the history that a host would have.
+
     With --json, each field has `contacts`: centroid, area, normal and shear force with standard deviations,
     in m, m² and N.
 
@@ -41,11 +53,13 @@ def replay(
     frames. The exit status is also 1 if a scan was torn or missed, or if a chunk or summary was lost. The
     exit status is 2 if the recording cannot be read.
     """
+    from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
 
+    plan = None if hand is None else load_hand(hand)
     with stop_on_signal() as stop:
-        run = play(recording, speed=None if fast else speed, cancelled=stop.is_set)
+        run = play(recording, speed=None if fast else speed, cancelled=stop.is_set, hand=plan)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
             assert field.stamp is not None  # the host timestamps every field
@@ -55,12 +69,15 @@ def replay(
             deepest_m[field.stamp.patch] = max(deepest_m[field.stamp.patch], depth_m)
     faults = _faults(run)
     if as_json:
-        print(json.dumps({"patches": _patches(run, deepest_m), "faults": faults}))
+        notes = {"notes": run.notes} if run.notes else {}
+        print(json.dumps({"patches": _patches(run, deepest_m), **notes, "faults": faults}))
     else:
         for name, facts in _patches(run, deepest_m).items():
             depth_m = facts.pop("deepest_m")
             counts = "  ".join(f"{key} {value}" for key, value in facts.items())
             print(f"{name}  {counts}  deepest {1e6 * depth_m:.1f} µm")
+        for note in run.notes:
+            print(f"note: {note}")
         for fault in faults:
             print(f"fault: {fault}")
     if faults:

@@ -1,9 +1,9 @@
 """Reads and writes the journal of a recording, which contains everything except the frames.
 
-The journal is a JSON Lines file next to the log. The first line contains the hand and the offset of the
-host's clock (:class:`Header`). Every other line is an event that affected how the host decoded the frames:
-``at`` is the number of frames received on ``bus`` before the event, and ``t_ns`` its time on the host's
-monotonic clock.
+The journal is a JSON Lines file next to the log or, in an MCAP file, a topic with one message per line.
+The first line contains the hand and the offset of the host's clock (:class:`Header`). Every other line is an
+event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
+the event, and ``t_ns`` its time on the host's monotonic clock.
 
 =============  ==============================================================================
 ``event``      meaning
@@ -23,10 +23,10 @@ monotonic clock.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -133,34 +133,60 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     )
 
 
-def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
+def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], list[bytes]]:
     """Read a journal.
 
     Args:
         path: The journal.
 
     Returns:
-        The header, the events, and a one-line message for each unreadable line.
+        The header, the events, a one-line message for each unreadable line, and all lines.
 
     Raises:
         ConfigError: The journal cannot be read, or its first line is not a header.
     """
     try:
         with path.open("rb") as file:
-            return _read_lines(path, file)
+            kept: list[bytes] = []
+            lines = iter(lambda: file.readline(_LONGEST_LINE), b"")
+            parsed = parse_journal(str(path), path.name, _noted(lines, kept))
+            return *parsed, kept
     except OSError as error:
-        allowed = f"a readable journal next to the log ({error.strerror})"
+        allowed = f"a journal next to the log ({error.strerror}); for a log without a journal, give --hand"
         raise ConfigError("recording", str(path), allowed) from None
 
 
-def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]], list[str]]:
-    line = file.readline(_LONGEST_LINE)
+def _noted(lines: Iterable[bytes], kept: list[bytes]) -> Iterator[bytes]:
+    """Yield the lines, and append them to ``kept``."""
+    for line in lines:
+        kept.append(line)
+        yield line
+
+
+def parse_journal(
+    where: str, name: str, lines: Iterable[bytes]
+) -> tuple[Header, list[dict[str, Any]], list[str]]:
+    """Parse the lines of a journal.
+
+    Args:
+        where: Path of the file, for error messages.
+        name: Name of the file in messages about unreadable lines.
+        lines: The lines, each with its line feed.
+
+    Returns:
+        The header, the events, and a one-line message for each unreadable line.
+
+    Raises:
+        ConfigError: The first line is not a header.
+    """
+    rest = iter(lines)
+    line = next(rest, b"")
     try:
         first = json.loads(line)
         if first["format"] != FORMAT:
-            raise ConfigError("format", first["format"], repr(FORMAT), where=str(path))
+            raise ConfigError("format", first["format"], repr(FORMAT), where=where)
         header = Header(
-            parse_hand(first["hand"], where=str(path)),
+            parse_hand(first["hand"], where=where),
             str(first["started"]),
             _whole(first["wall_minus_mono_ns"], least=-_MOST),
         )
@@ -168,11 +194,11 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
         raise
     except (ValueError, KeyError, TypeError, RecursionError):
         shown = line.rstrip(b"\n")[:40].decode("ascii", "replace")
-        raise ConfigError("line 1", shown, "the header of a recording's journal", where=str(path)) from None
+        raise ConfigError("line 1", shown, "the header of a recording's journal", where=where) from None
     events: list[dict[str, Any]] = []
     complaints: list[str] = []
     bad = 0
-    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), 2):
+    for number, line in enumerate(rest, 2):
         if not line.strip():
             continue
         try:
@@ -181,7 +207,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
             bad += 1
             if bad <= COMPLAINTS_KEPT:
                 what = "no event" if line.endswith(b"\n") else "truncated"
-                complaints.append(f"{path.name} line {number}: {what}")
+                complaints.append(f"{name} line {number}: {what}")
     if bad > COMPLAINTS_KEPT:
         complaints.append(f"{bad - COMPLAINTS_KEPT} more unreadable lines")
     return header, events, complaints

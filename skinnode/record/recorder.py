@@ -1,4 +1,4 @@
-"""Records the frames of a running host.
+"""Records the frames of a running host and, in an MCAP file, also its fields, contacts, health and events.
 
 The host's threads only queue entries, and a separate thread writes them. A slow disk therefore delays only
 the recording.
@@ -10,21 +10,27 @@ import datetime
 import json
 import logging
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects, keep_on
+from skinnode.host.events import HealthEvent
+from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.scan_solver import ScanSolver
+from skinnode.model.frames import FieldFrame
 from skinnode.process import clock
-from skinnode.record.journal import SUFFIX, Header, facts_table
+from skinnode.record.journal import Header, facts_table
+from skinnode.record.log_files import LogFiles
+from skinnode.record.mcap_file import MCAP, McapFile
 from skinnode.transport.frame import Frame
-from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFrame, create
+from skinnode.transport.frame_log import SUFFIXES
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +47,9 @@ blocks the writer thread for about 10 ms."""
 CAPACITY: Final = 50_000
 """Maximum number of queued batches of frames, enough for several seconds on four fully loaded buses."""
 
-_ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
+RecordingFormat = Literal["log", "blf", "mcap"]
+
+_ALLOWED: Final = "a folder (created if needed), or a file ending in .log, .blf or .mcap"
 
 _Entry = Callable[[], None]
 
@@ -56,9 +64,13 @@ class RecorderStats:
     """Number of frames not written because the disk was too slow or failed."""
     failure: str | None
     """One-line reason why recording stopped; None while it continues."""
+    fields: int = 0
+    """Number of fields written; only an MCAP file contains fields."""
+    fields_dropped: int = 0
+    """Number of fields not written because the disk was too slow or failed."""
 
 
-def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
+def name_in(folder: Path, hand: HandConfig, kind: RecordingFormat, now: datetime.datetime) -> Path:
     """Return a path in ``folder`` for a recording, composed of the hand's name, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
@@ -107,38 +119,34 @@ class Recorder:
 
     Args:
         hand: The hand.
-        path: A file name ending in .log or .blf; or a folder, created if needed, for a file named after the
-            hand, the date and the time. The journal is written next to the file.
+        path: A file name ending in .log, .blf or .mcap; or a folder, created if needed, for a file named
+            after the hand, the date and the time. The journal of a .log or .blf file is written next to it.
         kind: File format if ``path`` is a folder.
 
     Raises:
-        ConfigError: The log or journal already exists, or a file or folder cannot be created.
+        ConfigError: The recording or its journal already exists, a file or folder cannot be created, or the
+            packages for .mcap are not installed.
     """
 
-    def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
+    def __init__(self, hand: HandConfig, path: Path | str, kind: RecordingFormat = "log") -> None:
         now, asked, path = datetime.datetime.now().astimezone(), str(path), Path(path)
         self._made: Path | None = None
         """Folder that this recorder created; None if the folder already existed or is not used."""
-        if asked and (_is_folder(path) or path.suffix not in SUFFIXES):
+        if asked and (_is_folder(path) or path.suffix not in (*SUFFIXES, MCAP)):
             self._made = make_folder(path)
             path = name_in(path, hand, kind, now)
-        elif path.suffix not in SUFFIXES:
+        elif path.suffix not in (*SUFFIXES, MCAP):
             raise ConfigError("recording", asked, _ALLOWED)
-        self._channels = channels(hand)
         offset_ns = clock.time_ns() - clock.monotonic_ns()
-        self._log = FrameLog(path, tuple(self._channels.values()))
-        try:
-            self._journal = create(path.with_suffix(SUFFIX))
-        except ConfigError:
-            self._log.close()
-            path.unlink()
-            raise
+        self._mcap = McapFile(path, hand) if path.suffix == MCAP else None
+        self._file = LogFiles(path, hand) if self._mcap is None else self._mcap
         self.path = path
+        self._hand = hand
         self._offset_ns = offset_ns
-        self._at = dict.fromkeys(self._channels, 0)
+        self._at = {bus.name: 0 for bus in hand.buses}
         self._bus_of = {patch.name: patch.bus for patch in hand.patches}
         self._solvers: dict[str, ScanSolver] = {}
-        self._lost = self._lost_reported = 0
+        self._lost = self._lost_reported = self._fields_lost = 0
         self._defects = Defects(str(path))
         self._flush_s = self._sync_s = clock.monotonic()
         self._ended = False
@@ -150,17 +158,25 @@ class Recorder:
 
     def stats(self) -> RecorderStats:
         """Return the number of frames recorded and lost so far."""
-        return RecorderStats(self._log.frames, self._lost, self._failure)
+        fields = 0 if self._mcap is None else self._mcap.fields
+        return RecorderStats(self._file.frames, self._lost, self._failure, fields, self._fields_lost)
+
+    @property
+    def records_fields(self) -> bool:
+        """Whether the file can contain fields, contacts, health and events."""
+        return self._mcap is not None
 
     # --- methods that the host's threads call
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch of received frames."""
-        self._put(lambda: self._write_frames(bus, frames, sent=False), len(frames))
+        log_ns = clock.monotonic_ns() + self._offset_ns
+        self._put(lambda: self._write_frames(bus, frames, log_ns, sent=False), len(frames))
 
     def sent(self, bus: str, frame: Frame) -> None:
         """Record a sent frame."""
-        self._put(lambda: self._write_frames(bus, (frame,), sent=True), 1)
+        log_ns = clock.monotonic_ns() + self._offset_ns
+        self._put(lambda: self._write_frames(bus, (frame,), log_ns, sent=True), 1)
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Record that the host starts or resumes decoding a patch's scans."""
@@ -181,6 +197,35 @@ class Recorder:
         """Record that a scan was skipped in favour of a newer one."""
         self._event(patch, "overtaken", scan=scan, received_ns=t_receive_ns)
 
+    # --- methods for the data that only an MCAP file can contain; see follow()
+
+    def field(self, field: FieldFrame) -> None:
+        """Record a field and its contacts. Any thread."""
+        file, log_ns = self._mcap, clock.monotonic_ns() + self._offset_ns
+        if file is None or field.stamp is None:
+            return
+        solver = self._solvers.get(field.stamp.patch)
+        layout = self._hand.patch(field.stamp.patch).layout.build() if solver is None else solver.facts.layout
+        rest_m = layout.upper_m
+        entry = partial(file.write_field, field, rest_m, self._offset_ns, log_ns)
+        self._fields_lost += not self._put(entry, 0)
+
+    def health(self, patches: Mapping[str, PatchHealth], buses: Mapping[str, BusHealth]) -> None:
+        """Record the health of all patches and buses. Any thread."""
+        if self._mcap is not None:
+            log_ns = clock.monotonic_ns() + self._offset_ns
+            self._put(partial(self._mcap.write_health, patches, buses, log_ns), 0)
+
+    def event(self, event: HealthEvent) -> None:
+        """Record an event. Any thread."""
+        if self._mcap is not None:
+            log_ns = clock.monotonic_ns() + self._offset_ns
+            self._put(partial(self._mcap.write_event, event, self._offset_ns, log_ns), 0)
+
+    def lose_fields(self, fields: int) -> None:
+        """Count fields that were lost before they reached the recorder."""
+        self._fields_lost += fields
+
     def close(self) -> None:
         """Write all queued entries, stop the thread and close the files; later entries are ignored."""
         if self._thread.is_alive():
@@ -195,18 +240,20 @@ class Recorder:
     ) -> None:
         self.close()
         # Delete an empty recording, because its files would make a retry fail.
-        if error is not None and not self._log.frames:
-            self.path.unlink(missing_ok=True)
-            self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
+        if error is not None and not self._file.frames:
+            self._file.remove()
             if self._made is not None:
                 with suppress(OSError):  # another process may have written to the folder
                     self._made.rmdir()
 
-    def _put(self, entry: _Entry, frames: int) -> None:
+    def _put(self, entry: _Entry, frames: int) -> bool:
+        """Queue an entry with a number of frames; return whether the entry was queued or is not wanted."""
         if self._failure is not None or self._queue.qsize() >= CAPACITY:
             self._lost += frames
-        elif self._thread.is_alive():
+            return False
+        if self._thread.is_alive():
             self._queue.put(entry)
+        return True
 
     def _event(self, patch: str, event: str, *, t_ns: int | None = None, **more: Any) -> None:
         bus, t_ns = self._bus_of[patch], clock.monotonic_ns() if t_ns is None else t_ns
@@ -216,10 +263,8 @@ class Recorder:
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")
-        self._try(lambda: self._write_event("", clock.monotonic_ns(), "ended", frames=self._log.frames))
-        with suppress(OSError):
-            self._journal.close()
-        self._log.close()
+        self._try(lambda: self._write_event("", clock.monotonic_ns(), "ended", frames=self._file.frames))
+        self._file.close()
 
     def _turn(self) -> bool:
         """Write the next entry if one arrives within a flush interval; return False after the last entry."""
@@ -252,37 +297,24 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal and then the log, so that the journal on disk is never the older of the two."""
+        """Write and flush everything so far."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)
-        self._journal.flush()
-        self._log.flush(to_disk=to_disk)
+        self._file.flush(to_disk=to_disk)
 
     def _begin(self, header: Header) -> None:
         """Write and flush the header, so that the recording is readable even if the process is killed."""
-        self._write_line(header.line())
-        self._journal.flush()
+        self._file.write_line(header.line(), clock.monotonic_ns() + self._offset_ns)
+        self._file.flush_journal()
 
-    def _write_line(self, line: str) -> None:
-        self._journal.write(line + "\n")
-
-    def _write_frames(self, bus: str, frames: Sequence[Frame], *, sent: bool) -> None:
-        channel, offset_ns = self._channels[bus], self._offset_ns
+    def _write_frames(self, bus: str, frames: Sequence[Frame], log_ns: int, *, sent: bool) -> None:
+        file, offset_ns = self._file, self._offset_ns
         for frame in frames:
-            self._log.write(LoggedFrame(frame._replace(t_ns=frame.t_ns + offset_ns), channel, sent))
+            file.write(bus, frame._replace(t_ns=frame.t_ns + offset_ns), sent=sent, log_ns=log_ns)
         if not sent:
             self._at[bus] += len(frames)
 
     def _write_event(self, bus: str, t_ns: int, event: str, **more: Any) -> None:
         place = {"bus": bus, "at": self._at.get(bus, 0), "t_ns": t_ns, "event": event}
-        self._write_line(json.dumps({**place, **more}))
-
-
-def channels(hand: HandConfig) -> dict[str, str]:
-    """Return the channel of each bus in the log: its name if candump accepts it, otherwise bus0, bus1, …."""
-    names = {}
-    for number, bus in enumerate(hand.buses):
-        plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16
-        names[bus.name] = bus.name if plain else f"bus{number}"
-    return names
+        self._file.write_line(json.dumps({**place, **more}), clock.monotonic_ns() + self._offset_ns)

@@ -1,24 +1,31 @@
-"""Writes CAN frames to a candump log (``.log``) or a Vector BLF file.
+"""Writes CAN frames to a candump log (``.log``), a Vector BLF file or a Vector ASC file.
 
 If the process is killed, no frame written before the last :meth:`FrameLog.flush` is lost. python-can's BLF
 writer buffers up to 128 kB, and completes the file header only when it stops. Flushing a BLF file therefore
 stops the writer, and a new writer appends the next frame.
+
+An ASC file contains its start time as local time without a time zone, and the time of each frame since then.
+The start time is a whole second here, because python-can's writer and reader disagree about its fractions. An
+ASC file does not contain the identifier and data of an error frame.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TextIO
+from typing import BinaryIO, Final, NamedTuple, TextIO
 
 import can
 
 from skinnode.errors import ConfigError
 from skinnode.transport.frame import Frame
 
-LogFormat = Literal["log", "blf"]
 SUFFIXES: Final = (".log", ".blf")
+"""Suffixes of logs that can be recorded: a file whose process was killed is readable up to the last flush."""
+WRITABLE: Final = (*SUFFIXES, ".asc")
+"""Suffixes of logs that can be written."""
 
 _CONTAINER_BYTES: Final = 1 << 20
 """Maximum size of a BLF container before compression, bytes. Less is written between two flushes, so no frame
@@ -30,7 +37,7 @@ class LoggedFrame(NamedTuple):
 
     frame: Frame
     channel: str
-    """Name of the channel or, if read from a BLF file, its number counted from 0."""
+    """Name of the channel or, if read from a BLF or ASC file, its number counted from 0."""
     sent: bool
     """Whether the recording program itself sent the frame."""
 
@@ -41,21 +48,21 @@ class FrameLog:
     :meth:`write` and :meth:`flush` raise OSError if writing fails.
 
     Args:
-        path: Path of the new file, ending in ``.log`` or ``.blf``.
-        channels: Names of the channels. In a BLF file, they are numbered in this order.
+        path: Path of the new file, ending in ``.log``, ``.blf`` or ``.asc``.
+        channels: Names of the channels. In BLF and ASC files, they are numbered in this order.
 
     Raises:
         ConfigError: if the suffix is wrong, or if the file already exists or cannot be created.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
-        if path.suffix not in SUFFIXES:
-            raise ConfigError("recording", str(path), "a file ending in .log or .blf")
+        if path.suffix not in WRITABLE:
+            raise ConfigError("recording", str(path), "a file ending in .log, .blf or .asc")
         self.path = path
         self._numbers = {name: number for number, name in enumerate(channels)}
-        self._is_blf = path.suffix == ".blf"
+        self._is_blf, self._is_asc = path.suffix == ".blf", path.suffix == ".asc"
         self._file = create(path)
-        self._writer: can.CanutilsLogWriter | can.BLFWriter | None = None
+        self._writer: can.CanutilsLogWriter | can.BLFWriter | can.ASCWriter | None = None
         self._begun = False
         self.frames = 0
         """Number of frames written."""
@@ -64,7 +71,8 @@ class FrameLog:
         """Write a frame. Until the next :meth:`flush`, a crash may lose it."""
         frame = logged.frame
         if self._writer is None:
-            self._writer = self._open()
+            self._writer = self._open(frame.t_ns)
+        numbered = self._is_blf or self._is_asc
         self._writer.on_message_received(
             can.Message(
                 timestamp=frame.t_ns * 1e-9,
@@ -72,7 +80,7 @@ class FrameLog:
                 is_extended_id=frame.extended,
                 is_remote_frame=frame.remote,
                 is_error_frame=frame.error,
-                channel=self._numbers[logged.channel] if self._is_blf else logged.channel,
+                channel=self._numbers[logged.channel] if numbered else logged.channel,
                 data=frame.data,
                 is_fd=frame.fd,
                 bitrate_switch=frame.fd,
@@ -97,11 +105,17 @@ class FrameLog:
     def close(self) -> None:
         """Close the file. Disk errors are ignored here, because earlier calls have reported them."""
         with contextlib.suppress(OSError):
+            if self._is_asc and self._writer is not None:
+                self._file.write("End TriggerBlock\n")
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):
             self._file.close()
 
-    def _open(self) -> can.CanutilsLogWriter | can.BLFWriter:
+    def _open(self, t_ns: int) -> can.CanutilsLogWriter | can.BLFWriter | can.ASCWriter:
+        if self._is_asc:
+            writer = can.ASCWriter(self._file)
+            writer.log_event("Start of recording", t_ns // 1_000_000_000)
+            return writer
         if not self._is_blf:
             return can.CanutilsLogWriter(self._file)
         self._begun, append = True, self._begun
@@ -124,8 +138,25 @@ def create(path: Path) -> TextIO:
     Raises:
         ConfigError: if the file already exists or cannot be created.
     """
-    try:
+    with _errors_of(path):
         return path.open("x", encoding="ascii")
+
+
+def create_binary(path: Path) -> BinaryIO:
+    """Create a new binary file.
+
+    Raises:
+        ConfigError: if the file already exists or cannot be created.
+    """
+    with _errors_of(path):
+        return path.open("xb")
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    """Convert errors of opening a new file to ConfigError."""
+    try:
+        yield
     except FileExistsError:
         raise ConfigError(
             "recording", str(path), "a new file; this one exists and is not overwritten"

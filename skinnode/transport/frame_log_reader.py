@@ -1,4 +1,4 @@
-"""Reads CAN frames from a candump log or a BLF file, even if the file is damaged.
+"""Reads CAN frames from a candump log, a BLF file or an ASC file, even if the file is damaged.
 
 The reader skips the damaged parts of a truncated or partly overwritten file, and records where they are
 (:class:`Damage`). Invalid content never causes an exception. A candump log has no checksums, so a corrupt
@@ -23,8 +23,10 @@ from skinnode.canopen.data_length import FD_LENGTHS
 from skinnode.errors import ConfigError
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
-from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
+from skinnode.transport.frame_log import WRITABLE, LoggedFrame
 
+READABLE: Final = WRITABLE
+"""Suffixes of logs that can be read."""
 DAMAGES_KEPT: Final = 100
 """Maximum number of damaged parts that are described. Further ones are only counted."""
 
@@ -58,12 +60,12 @@ class FrameLogReader:
     """Iterable over the frames of a log file. It can be iterated over once, by one thread.
 
     Raises:
-        ConfigError: if the file cannot be opened, or its suffix is neither ``.log`` nor ``.blf``.
+        ConfigError: if the file cannot be opened, or its suffix is not ``.log``, ``.blf`` or ``.asc``.
     """
 
     def __init__(self, path: Path) -> None:
-        if path.suffix not in SUFFIXES:
-            raise ConfigError("recording", str(path), "a file ending in .log or .blf")
+        if path.suffix not in READABLE:
+            raise ConfigError("recording", str(path), "a file ending in .log, .blf or .asc")
         try:
             self._file = path.open("rb")
         except OSError as error:
@@ -76,7 +78,7 @@ class FrameLogReader:
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         with self._file:
-            yield from self._blf() if self.path.suffix == ".blf" else self._candump()
+            yield from {".blf": self._blf, ".asc": self._asc}.get(self.path.suffix, self._candump)()
 
     def close(self) -> None:
         """Stop reading and close the file."""
@@ -100,6 +102,22 @@ class FrameLogReader:
                 cut = not line.endswith(b"\n") and len(line) < _LONGEST_LINE
                 self._complain(number, offset, f"{'truncated' if cut else 'no frame'}: {_shown(line)}")
             offset += len(line)
+
+    # --- ASC
+
+    def _asc(self) -> Iterator[LoggedFrame]:
+        """Yield the frames of an ASC file. python-can parses the file and skips lines that are no frames."""
+        head = self._file.read(_ASC_HEAD_BYTES)
+        if re.search(rb"^date\s", head, re.MULTILINE | re.IGNORECASE) is None:
+            self._complain(1, 0, f"no ASC file: {_shown(head[:16])}")
+            return
+        self._file.seek(0)
+        text = io.TextIOWrapper(self._file, encoding="ascii", errors="replace")
+        try:
+            for message in can.ASCReader(text, relative_timestamp=False):
+                yield _numbered_frame(message)
+        except Exception as error:  # python-can raises various exceptions for invalid data
+            self._complain(None, 0, f"unreadable from some line on ({type(error).__name__}: {error})")
 
     # --- BLF
 
@@ -197,7 +215,7 @@ class FrameLogReader:
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:
             for message in can.BLFReader(file):
-                yield _blf_frame(message)
+                yield _numbered_frame(message)
         except Exception as error:  # python-can raises various exceptions for invalid data
             self._complain(None, container, f"objects that cannot be read ({type(error).__name__}: {error})")
 
@@ -244,6 +262,8 @@ def _shown(data: bytes) -> str:
     return repr(shown + ("…" if len(data) > 40 else ""))
 
 
+_ASC_HEAD_BYTES: Final = 1024
+
 # --- BLF: sizes are those of python-can's can/io/blf.py
 
 _OBJECT: Final = struct.Struct("<4sHHLL")  # "LOBJ", header size, version, object size, object type
@@ -269,7 +289,7 @@ def _find_container(data: mmap.mmap, at: int) -> int:
     return len(data)
 
 
-def _blf_frame(message: can.Message) -> LoggedFrame:
+def _numbered_frame(message: can.Message) -> LoggedFrame:
     frame = Frame(
         message.arbitration_id,
         b"" if message.is_remote_frame else bytes(message.data),

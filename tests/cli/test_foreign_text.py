@@ -155,6 +155,15 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
         [place.hand(), "-o", place.missing],
     ],
     "replay": lambda place: [[place.missing], [place.file("evil.log", f"(1.0) {EVIL} 123#00\n")]],
+    "convert": lambda place: [
+        [place.missing, WORSE],
+        [
+            place.file("evil.log", f"(1.0) {EVIL} 123#00\n"),
+            str(place.folder / "x.npz"),
+            "--hand",
+            place.hand(),
+        ],
+    ],
     "conformance": lambda place: [
         [
             *["--node-id", "5", *place.bus, "--eds", place.eds(), "--only", "EDS,OD,SDO-02"],
@@ -172,6 +181,7 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
             "accuracy",
             "node",
             "pipeline",
+            "recording",
             "scale",
             "soak",
             "stability",

@@ -37,7 +37,7 @@ MOST_NOT_RUN = 7
 WIDEST = 104
 """Columns of code that fit on a page without scrolling."""
 
-SLOWED = {"first-ten-minutes.md", "monitor.md"}
+SLOWED = {"first-ten-minutes.md", "monitor.md", "recordings.md"}
 """Pages whose simulated hand scans at a third of the rate, so that a busy machine keeps up."""
 
 _PRINTED = (PRINTS, PRINTS_EXACTLY)

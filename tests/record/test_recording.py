@@ -266,12 +266,14 @@ def test_an_empty_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     done = CliRunner().invoke(app, ["record", "hand.toml", "-o", ""])
     assert isinstance(done.exception, ConfigError)
     assert str(done.exception) == (
-        "recording: got '', allowed: a folder (created if needed), or a file ending in .log or .blf"
+        "recording: got '', allowed: a folder (created if needed), or a file ending in .log, .blf or .mcap"
     )
     assert list(tmp_path.iterdir()) == [tmp_path / "hand.toml"]
 
 
 @pytest.mark.parametrize("name", ["", ".", "/"])
 def test_what_has_no_name_is_no_recording(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"^recording: got '[./]', allowed: a file ending in .log or .blf$"):
+    with pytest.raises(
+        ConfigError, match=r"^recording: got '[./]', allowed: a file ending in .log, .blf, .asc or .mcap$"
+    ):
         replay(name)

@@ -48,8 +48,8 @@ def key(field: FieldFrame) -> tuple[str, int]:
 
 @pytest.mark.parametrize(
     ("suffix", "unchecked"),
-    [(".log", ()), (".blf", ()), (".log", ("p0", "p1")), (".log", ("p1",))],
-    ids=["log", "blf", "all nodes of revision 1.0", "one node of revision 1.0"],
+    [(".log", ()), (".blf", ()), (".mcap", ()), (".log", ("p0", "p1")), (".log", ("p1",))],
+    ids=["log", "blf", "mcap", "all nodes of revision 1.0", "one node of revision 1.0"],
 )
 def test_a_replay_gives_the_bits_of_the_live_run(
     tmp_path: Path, suffix: str, unchecked: tuple[str, ...]
@@ -235,7 +235,7 @@ assert stats.failure is not None and "disk" in stats.failure, stats
 """
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf"])
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".mcap"])
 def test_a_full_disk_is_one_line_and_nobody_is_held_up(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"run{suffix}"
     done = subprocess.run(

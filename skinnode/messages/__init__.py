@@ -1,0 +1,21 @@
+"""ROS 2 messages of a hand: standard messages where one exists, and ``skinnode_msgs`` for the rest.
+
+``definitions`` contains the message definitions that rosbags does not include. ``typestore`` encodes and
+decodes messages as CDR with rosbags, an optional dependency. Each of the other modules converts data of the
+host: ``can_frames`` raw CAN frames, ``fields`` displacement fields, ``contacts`` contacts and their wrenches,
+``health`` health and events, and ``poses`` the poses of patches and links. ``topics`` names topics and
+coordinate frames.
+
+==============================  =================================================================
+data                            message
+==============================  =================================================================
+classic CAN frame               ``can_msgs/Frame``, as in ros_canopen and ros2_socketcan
+CAN FD frame                    ``ros2_socketcan_msgs/FdFrame``
+displacement field              ``sensor_msgs/PointCloud2`` and ``skinnode_msgs/FieldInfo``
+contact                         ``geometry_msgs/WrenchStamped`` and ``skinnode_msgs/Contacts``
+health of patches and buses     ``diagnostic_msgs/DiagnosticArray``
+event                           ``rcl_interfaces/Log``
+poses of patches and links      ``tf2_msgs/TFMessage``
+line of a recording's journal   ``skinnode_msgs/JournalLine``
+==============================  =================================================================
+"""

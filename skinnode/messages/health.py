@@ -1,0 +1,103 @@
+"""Converts health to ``diagnostic_msgs/DiagnosticArray``, and events to ``rcl_interfaces/Log``."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from typing import Any, Final
+
+from skinnode.host.events import HealthEvent
+from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.open_and_shorted_wires import WireFault
+from skinnode.messages.typestore import header, message_type, time_of
+
+DIAGNOSTIC_ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
+LOG: Final = "rcl_interfaces/msg/Log"
+
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
+
+_LEVEL: Final = {
+    Condition.OPERATIONAL: OK,
+    Condition.BOOTING: WARN,
+    Condition.STALE: STALE,
+    Condition.NEVER_SEEN: STALE,
+    Condition.LOST: STALE,
+}
+"""Level of each condition; every other condition is an error."""
+_INFO, _WARN = 20, 30
+"""Levels of ``rcl_interfaces/Log``."""
+
+
+def diagnostics(
+    hand: str, patches: Mapping[str, PatchHealth], buses: Mapping[str, BusHealth], t_ns: int
+) -> Any:
+    """Return the health of a hand as ``diagnostic_msgs/DiagnosticArray``, one status per patch and bus.
+
+    Args:
+        hand: Name of the hand.
+        patches: Health of each patch, by name.
+        buses: Health of each bus, by name.
+        t_ns: Time since 1970, ns.
+    """
+    make = message_type("diagnostic_msgs/msg/DiagnosticStatus")
+    statuses = [
+        make(
+            level=level_of(health),
+            name=f"{hand}: {name}",
+            message=_joined(str(health.condition), health.reason),
+            hardware_id=f"node {health.node_id}",
+            values=_values(health),
+        )
+        for name, health in patches.items()
+    ]
+    statuses += [
+        make(
+            level=OK if bus.away is None and not bus.no_sync else ERROR,
+            name=f"{hand}: {name}",
+            message=bus.away or ("no SYNC" if bus.no_sync else "available"),
+            hardware_id=name,
+            values=_values(bus),
+        )
+        for name, bus in buses.items()
+    ]
+    return message_type(DIAGNOSTIC_ARRAY)(header(t_ns, ""), statuses)
+
+
+def level_of(health: PatchHealth) -> int:
+    """Return the diagnostic level of a patch; an operational patch with faulty wires or readings is WARN."""
+    level = _LEVEL.get(health.condition, ERROR)
+    return WARN if level == OK and (health.wires or health.faults or health.life) else level
+
+
+def log_message(event: HealthEvent, t_ns: int) -> Any:
+    """Return an event as ``rcl_interfaces/Log``: its subject as name, and its type as function.
+
+    Args:
+        event: The event.
+        t_ns: Time of the event since 1970, ns.
+    """
+    level = _INFO if event.what in (Condition.OPERATIONAL, Condition.BOOTING, "baselines") else _WARN
+    return message_type(LOG)(time_of(t_ns), level, event.subject, event.text, "skinnode", event.what, 0)
+
+
+def _joined(condition: str, reason: str) -> str:
+    return f"{condition}: {reason}" if reason else condition
+
+
+def _values(health: PatchHealth | BusHealth) -> list[Any]:
+    """Return every value that is known, as text."""
+    make = message_type("diagnostic_msgs/msg/KeyValue")
+    values = ((entry.name, getattr(health, entry.name)) for entry in dataclasses.fields(health))
+    return [make(name, _text(value)) for name, value in values if value is not None]
+
+
+def _text(value: object) -> str:
+    if isinstance(value, WireFault):
+        return f"{value.side} wire {value.number} {value.state}"
+    if isinstance(value, enum.Enum):
+        return str(value) if isinstance(value, str) else value.name.lower()
+    if isinstance(value, tuple):
+        return "; ".join(map(_text, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

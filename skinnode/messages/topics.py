@@ -1,0 +1,90 @@
+"""Names the ROS 2 topics of a hand and the coordinate frames of its patches.
+
+A name in ROS 2 contains only letters, digits and underscores. Other characters of the names in the hand file
+become underscores.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from skinnode.config import HandConfig
+
+DIAGNOSTICS: Final = "/diagnostics"
+TF_STATIC: Final = "/tf_static"
+
+
+class PatchTopics(NamedTuple):
+    """Topics of a patch."""
+
+    field: str
+    field_info: str
+    contacts: str
+    contact_wrenches: str
+
+
+class BusTopics(NamedTuple):
+    """Topics of a bus, named as by ros2_socketcan."""
+
+    received: str
+    sent: str
+    received_fd: str
+    sent_fd: str
+
+
+@dataclass(frozen=True, slots=True)
+class HandTopics:
+    """Topics of a hand."""
+
+    patches: dict[str, PatchTopics]
+    buses: dict[str, BusTopics]
+    events: str
+    journal: str
+
+    @classmethod
+    def of(cls, hand: HandConfig) -> HandTopics:
+        """Return the topics of a hand."""
+        base = f"/{_tokens([hand.name])[hand.name]}"
+        patches = _tokens([patch.name for patch in hand.patches])
+        buses = _tokens([bus.name for bus in hand.buses])
+        return cls(
+            {
+                name: PatchTopics(*(f"{base}/{token}/{part}" for part in PatchTopics._fields))
+                for name, token in patches.items()
+            },
+            {
+                name: BusTopics(
+                    *(
+                        f"{base}/{token}/{part}"
+                        for part in ("from_can_bus", "to_can_bus", "from_can_bus_fd", "to_can_bus_fd")
+                    )
+                )
+                for name, token in buses.items()
+            },
+            f"{base}/events",
+            f"{base}/journal",
+        )
+
+
+def patch_frame(patch: str) -> str:
+    """Return the name of the coordinate frame of a patch.
+
+    The prefix distinguishes a patch from a link of the same name. Links keep their names, and the hand is
+    ``hand``.
+    """
+    return f"skin/{patch}"
+
+
+def _tokens(names: Iterable[str]) -> dict[str, str]:
+    """Return a valid and unique ROS 2 name for each name."""
+    tokens: dict[str, str] = {}
+    for name in names:
+        token = re.sub("[^A-Za-z0-9_]", "_", name) or "_"
+        token = re.sub("__+", "_", f"_{token}" if token[0].isdigit() else token)
+        while token in tokens.values():
+            token += "x"
+        tokens[name] = token
+    return tokens

@@ -1,0 +1,253 @@
+"""Converts recordings between file formats, and computes tables of fields from them.
+
+The suffixes of the files determine the formats. A conversion between two files with frames copies every frame
+and the journal, so a replay of the result computes the same fields. An MCAP file also gets the fields,
+contacts and poses, which a replay computes. A table of fields contains what a replay computes, with the
+resistances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Protocol
+
+from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
+from skinnode.model.frames import FieldFrame
+from skinnode.record.copy_mcap import copy_mcap
+from skinnode.record.field_rows import FieldRow, row_of
+from skinnode.record.journal import SUFFIX
+from skinnode.record.log_files import LogFiles
+from skinnode.record.mcap_file import MCAP, McapFile
+from skinnode.record.npz_file import NpzFile, read_npz
+from skinnode.record.parquet_file import ParquetFile, read_parquet
+from skinnode.record.replay import Replay
+from skinnode.record.sources import FRAME_FILES, Frames, OpenRecording, open_log, open_recording
+from skinnode.transport.frame_log import WRITABLE, LoggedFrame
+from skinnode.transport.frame_log_reader import Damage
+
+PARQUET, NPZ = ".parquet", ".npz"
+TABLES: Final = (PARQUET, NPZ)
+TARGETS: Final = (*FRAME_FILES, *TABLES)
+
+_FLUSH_FRAMES: Final = 5_000
+"""Number of frames between two flushes. A BLF container between two flushes must not overflow."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """Result of a conversion."""
+
+    frames: int
+    """Number of CAN frames written."""
+    fields: int
+    """Number of fields written."""
+    faults: tuple[str, ...]
+    """Missing or unreadable parts of the source."""
+    notes: tuple[str, ...]
+    """Data that the target cannot contain, and assumptions."""
+
+
+class FieldTable(Protocol):
+    """New table of fields."""
+
+    def write(self, row: FieldRow) -> None:
+        """Write a row."""
+
+    def close(self) -> None:
+        """Complete the file."""
+
+
+def convert(
+    source: Path, target: Path, *, hand: HandConfig | None = None, frames_only: bool = False
+) -> Conversion:
+    """Convert a recording or a table of fields. If the conversion fails, the target is deleted.
+
+    Args:
+        source: Existing file.
+        target: New file.
+        hand: Hand for a log without a journal; see :func:`skinnode.record.sources.open_log`.
+        frames_only: Whether to leave the fields out of an MCAP file.
+
+    Raises:
+        ConfigError: The source cannot be read, the target exists or cannot be written, there is no such
+            conversion, or the packages for a format are not installed.
+    """
+    taken = _check(source, target, hand)
+    try:
+        if source.suffix in TABLES:
+            return _copy_table(source, target)
+        if source.suffix == target.suffix == MCAP and hand is None:
+            return _copy_mcap(source, target)
+        recording = open_recording(source) if hand is None else open_log(source, hand)
+        if target.suffix in TABLES:
+            return _tabulate(recording, target)
+        return _copy_frames(recording, target, fields=target.suffix == MCAP and not frames_only)
+    except BaseException:
+        with suppress(OSError):
+            for path in taken:
+                path.unlink(missing_ok=True)
+        raise
+
+
+def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
+    """Return the files to create. Raises ConfigError if there is no such conversion, or if a file exists."""
+    if source.suffix not in TARGETS:
+        raise ConfigError("source", str(source), _ending_in(TARGETS))
+    allowed = TABLES if source.suffix in TABLES else TARGETS
+    if target.suffix not in allowed:
+        why = "; a table of fields contains no frames" if source.suffix in TABLES else ""
+        raise ConfigError("target", str(target), _ending_in(allowed) + why)
+    if source.suffix in TABLES and hand is not None:
+        raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
+    taken = [target]
+    if target.suffix in WRITABLE and not _share_journal(source, target):
+        taken.append(target.with_suffix(SUFFIX))
+    for path in taken:
+        if path.exists():
+            raise ConfigError("target", str(path), "a new file; this one exists and is not overwritten")
+    if not target.parent.is_dir():
+        raise ConfigError("target", str(target), "a file in an existing folder")
+    return taken
+
+
+def _share_journal(source: Path, target: Path) -> bool:
+    """Return whether both files are logs of the same name in the same folder, which have the same journal."""
+    return {source.suffix, target.suffix} <= set(WRITABLE) and source.with_suffix("") == target.with_suffix(
+        ""
+    )
+
+
+def _ending_in(suffixes: tuple[str, ...]) -> str:
+    return f"a file ending in {', '.join(suffixes[:-1])} or {suffixes[-1]}"
+
+
+def _copy_mcap(source: Path, target: Path) -> Conversion:
+    frames, fields, faults = copy_mcap(source, target)
+    return Conversion(frames, fields, tuple(faults), ())
+
+
+def _copy_table(source: Path, target: Path) -> Conversion:
+    hand, rows = read_parquet(source) if source.suffix == PARQUET else read_npz(source)
+    lost = f"{target.name} cannot contain contacts and faults" if target.suffix == NPZ else None
+    if source.suffix == NPZ and target.suffix == PARQUET:
+        lost = f"{source.name} contains no contacts and faults"
+    fields = _write_table(target, hand, rows)
+    return Conversion(0, fields, (), () if lost is None or source.suffix == target.suffix else (lost,))
+
+
+def _tabulate(recording: OpenRecording, target: Path) -> Conversion:
+    run = Replay(recording, keep_resistances=True)
+    fields = _write_table(target, recording.lines[0] if recording.lines else "", _rows(run))
+    lost = "frames, journal, health and events; a recording cannot be made from it again"
+    if target.suffix == NPZ:
+        lost = f"contacts, faults, {lost}"
+    return Conversion(0, fields, tuple(run.flaws), (*run.notes, f"{target.name} cannot contain {lost}"))
+
+
+def _rows(run: Replay) -> Iterator[FieldRow]:
+    kept = run.resistances
+    assert kept is not None
+    for field in run:
+        yield row_of(field, kept.popleft(), run.offset_ns)
+
+
+def _write_table(target: Path, hand: str, rows: Iterator[FieldRow]) -> int:
+    table: FieldTable = ParquetFile(target, hand) if target.suffix == PARQUET else NpzFile(target, hand)
+    count = 0
+    try:
+        for row in rows:
+            table.write(row)
+            count += 1
+    except BaseException:
+        if isinstance(table, NpzFile):
+            table.discard()
+        raise
+    table.close()
+    return count
+
+
+def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Conversion:
+    hand = recording.header.hand
+    file = (
+        McapFile(target, hand)
+        if target.suffix == MCAP
+        else LogFiles(
+            target,
+            hand,
+            journal=not (recording.foreign or _share_journal(recording.frames.path, target)),
+        )
+    )
+    offset_ns = recording.header.wall_minus_mono_ns
+    for number, line in enumerate(recording.lines):
+        at_ns = recording.events[0]["t_ns"] if recording.events and number else 0
+        file.write_line(line, at_ns + offset_ns)
+    file.flush_journal()
+    tee = _Tee(recording, file)
+    run = Replay(replace(recording, frames=tee))
+    if fields and isinstance(file, McapFile):
+        for field in run:
+            _write_field(file, run, field)
+    else:
+        for _ in run.frames():
+            pass
+    file.close()
+    written = file.fields if isinstance(file, McapFile) else 0
+    return Conversion(file.frames, written, tuple(run.flaws), (*run.notes, *_losses(recording, target, tee)))
+
+
+def _write_field(file: McapFile, run: Replay, field: FieldFrame) -> None:
+    stamp = field.stamp
+    assert stamp is not None
+    log_ns = stamp.t_receive_ns + run.offset_ns
+    file.write_field(field, run.layout(stamp.patch).upper_m, run.offset_ns, log_ns)
+
+
+class _Tee:
+    """Frames of a recording, which are written to a file while they are read."""
+
+    def __init__(self, recording: OpenRecording, file: LogFiles | McapFile) -> None:
+        self._frames, self._file, self._channels = recording.frames, file, recording.channels
+        self.path = recording.frames.path
+        self.errors = 0
+        """Number of error frames."""
+
+    @property
+    def damages(self) -> list[Damage]:
+        return self._frames.damages
+
+    @property
+    def damaged(self) -> int:
+        return self._frames.damaged
+
+    def __iter__(self) -> Iterator[LoggedFrame]:
+        for number, logged in enumerate(self._frames, 1):
+            frame, bus = logged.frame, self._channels.bus(logged.channel)
+            if bus is not None:
+                self._file.write(bus, frame, sent=logged.sent, log_ns=frame.t_ns)
+                self.errors += frame.error
+            if number % _FLUSH_FRAMES == 0:
+                self._file.flush(to_disk=False)
+            yield logged
+
+    def close(self) -> None:
+        self._frames.close()
+
+
+def _losses(recording: OpenRecording, target: Path, tee: _Tee) -> list[str]:
+    """Describe what the target cannot contain, in at most one line."""
+    lost = []
+    from_mcap = recording.frames.path.suffix == MCAP
+    if from_mcap and target.suffix != MCAP:
+        lost += ["recorded fields, contacts, health and events (a replay computes the fields and contacts)"]
+        lost += ["times finer than 1 µs"]
+    if target.suffix == ".asc":
+        lost += ["the time zone"]
+        lost += ["identifier and data of error frames"] if tee.errors else []
+    return [f"{target.name} cannot contain {'; '.join(lost)}"] if lost else []
+
+
+__all__ = ["NPZ", "PARQUET", "TABLES", "TARGETS", "Conversion", "Frames", "convert"]

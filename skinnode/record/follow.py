@@ -1,0 +1,73 @@
+"""Records the fields, contacts, health and events of a running host in an MCAP file."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from typing import Final
+
+from skinnode.config import BusConfig
+from skinnode.host import Host
+from skinnode.host.events import EventSubscription
+from skinnode.process import clock
+from skinnode.record.recorder import Recorder
+
+HEALTH_S: Final = 1.0
+"""Interval between two records of the health of all patches and buses, s."""
+
+CAPACITY_FIELDS: Final = 4096
+"""Maximum number of fields queued for the recorder, about ten seconds of sixteen patches."""
+
+_POLL_S: Final = 0.2
+
+
+@contextlib.contextmanager
+def followed(recorder: Recorder, host: Host) -> Iterator[None]:
+    """Record fields, contacts, health and events of ``host`` while the ``with`` block is active.
+
+    Without effect if the recording is not an MCAP file. A slow disk costs the recording its oldest fields,
+    which are counted in ``RecorderStats.fields_dropped``; the host is not delayed.
+
+    Args:
+        recorder: Recorder of the host's frames.
+        host: Running host.
+    """
+    if not recorder.records_fields:
+        yield
+        return
+    callback = host.on_field(recorder.field, capacity=CAPACITY_FIELDS)
+    events, over = host.events(), clock.event()
+    watcher = clock.thread(target=lambda: _watch(recorder, host, events, over), name="record health")
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+        callback.close()
+        recorder.lose_fields(callback.dropped + callback.failed)
+
+
+def _watch(recorder: Recorder, host: Host, events: EventSubscription, over: threading.Event) -> None:
+    """Record each event at once, and the health every second and at the end."""
+    due_s = clock.monotonic()
+    ended = False
+    while not ended:
+        ended = over.is_set()
+        now_s = clock.monotonic()
+        if now_s >= due_s or ended:
+            due_s = now_s + HEALTH_S
+            recorder.health(
+                {patch.name: host.health(patch.name) for patch in host.hand.patches},
+                {bus.name: host.bus_health(bus.name) for bus in _served(host)},
+            )
+        timeout_s = 0.0 if ended else min(_POLL_S, max(0.0, due_s - clock.monotonic()))
+        while (event := events.get(timeout_s)) is not None:
+            recorder.event(event)
+            timeout_s = 0.0
+
+
+def _served(host: Host) -> list[BusConfig]:
+    """Return the buses that carry patches."""
+    return [bus for bus in host.hand.buses if host.hand.patches_on(bus.name)]

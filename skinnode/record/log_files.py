@@ -1,0 +1,87 @@
+"""Writes a recording as a candump log or a BLF file, with the journal in a file next to it."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
+from skinnode.record.journal import SUFFIX
+from skinnode.transport.frame import Frame
+from skinnode.transport.frame_log import FrameLog, LoggedFrame, create
+
+
+class LogFiles:
+    """Log and journal of a recording. Only one thread may write.
+
+    All methods that write raise OSError if writing fails.
+
+    Args:
+        path: Path of the new log.
+        hand: The hand.
+        journal: Whether to write a journal.
+
+    Raises:
+        ConfigError: The log or the journal already exists or cannot be created.
+    """
+
+    def __init__(self, path: Path, hand: HandConfig, *, journal: bool = True) -> None:
+        self.path = path
+        self._channels = channels(hand)
+        self._log = FrameLog(path, tuple(self._channels.values()))
+        self._journal = None
+        try:
+            if journal:
+                self._journal = create(path.with_suffix(SUFFIX))
+        except ConfigError:
+            self._log.close()
+            path.unlink()
+            raise
+
+    @property
+    def frames(self) -> int:
+        """Number of frames written."""
+        return self._log.frames
+
+    def write(self, bus: str, frame: Frame, *, sent: bool, log_ns: int) -> None:
+        """Write a frame. Its ``t_ns`` is a time since 1970; the format has no place for ``log_ns``."""
+        self._log.write(LoggedFrame(frame, self._channels[bus], sent))
+
+    def write_line(self, line: str, log_ns: int) -> None:
+        """Write a line of the journal."""
+        if self._journal is not None:
+            self._journal.write(line + "\n")
+
+    def flush(self, *, to_disk: bool) -> None:
+        """Flush the journal and then the log, so that the journal on disk is never the older of the two."""
+        if self._journal is not None:
+            self._journal.flush()
+        self._log.flush(to_disk=to_disk)
+
+    def flush_journal(self) -> None:
+        """Flush the journal."""
+        if self._journal is not None:
+            self._journal.flush()
+
+    def close(self) -> None:
+        """Close the files. Disk errors are ignored here, because earlier calls have reported them."""
+        if self._journal is not None:
+            with contextlib.suppress(OSError):
+                self._journal.close()
+        self._log.close()
+
+    def remove(self) -> None:
+        """Delete the files."""
+        self.path.unlink(missing_ok=True)
+        if self._journal is not None:
+            self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
+
+
+def channels(hand: HandConfig) -> dict[str, str]:
+    """Return the channel of each bus in the log: its name if candump accepts it, otherwise bus0, bus1, …."""
+    names = {}
+    for number, bus in enumerate(hand.buses):
+        plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16
+        names[bus.name] = bus.name if plain else f"bus{number}"
+    return names

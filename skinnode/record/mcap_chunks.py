@@ -1,0 +1,236 @@
+"""Reads the messages of an MCAP file chunk by chunk, even if the file is damaged or lacks its end.
+
+The library's own readers stop at the first damaged record. This reader skips damaged parts, and records where
+they are. The library parses the records and checks the checksum of each chunk.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import struct
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
+
+from skinnode.errors import ConfigError
+from skinnode.transport.frame_log_reader import DAMAGES_KEPT, Damage
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+
+_HEAD: Final = struct.Struct("<BQ")  # opcode and length of each record
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # of a chunk: two times, size, checksum, length of the next word
+_COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
+_MOST_CHUNK: Final = 1 << 26
+"""Maximum size of a chunk before compression, bytes; usually 1 MiB. Larger sizes are due to damage."""
+_AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
+
+
+@dataclass(frozen=True, slots=True)
+class McapMessage:
+    """Message of an MCAP file with its channel and its schema, None if the message has no schema."""
+
+    message: Message
+    channel: Channel
+    schema: Schema | None
+    offset: int
+    """Offset of the chunk in the file, bytes."""
+
+
+class McapChunks:
+    """Messages of an MCAP file in the order of the file, which is open only while it is read.
+
+    Args:
+        path: The file.
+        check: Function called with each schema that is read; its exceptions are propagated.
+
+    Raises:
+        ConfigError: The file cannot be read or is not an MCAP file.
+    """
+
+    def __init__(self, path: Path, check: Callable[[Schema], None]) -> None:
+        self.path, self._check = path, check
+        _open(path).close()
+        self.damages: list[Damage] = []
+        """First :data:`DAMAGES_KEPT` damaged parts of the file."""
+        self.damaged = 0
+        """Number of damaged parts found so far."""
+
+    def messages(self, names: Collection[str] | None, *, by_index: bool = False) -> Iterator[McapMessage]:
+        """Yield the messages with some schemas.
+
+        Args:
+            names: Names of the schemas; None for all messages.
+            by_index: Whether to skip chunks that contain no such message according to their index. This
+                requires that the first message on each topic is in the chunk that defines the topic.
+        """
+
+        def wanted(channel: int) -> bool:
+            if names is None or channel not in channels:
+                return True
+            schema = schemas.get(channels[channel].schema_id)
+            return schema is not None and schema.name in names
+
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        self.damages, self.damaged = [], 0
+        with _open(self.path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            for offset, item in self._records(data, wanted if by_index else None):
+                if isinstance(item, Schema):
+                    self._check(item)
+                    schemas[item.id] = item
+                elif isinstance(item, Channel):
+                    channels[item.id] = item
+                elif isinstance(item, Message) and item.channel_id in channels and wanted(item.channel_id):
+                    channel = channels[item.channel_id]
+                    yield McapMessage(item, channel, schemas.get(channel.schema_id), offset)
+
+    def complain(self, offset: int, what: str) -> None:
+        """Record a damaged part of the file."""
+        self.damaged += 1
+        if len(self.damages) < DAMAGES_KEPT:
+            self.damages.append(Damage(None, offset, what))
+
+    def _records(
+        self, data: mmap.mmap, wanted: Callable[[int], bool] | None
+    ) -> Iterator[tuple[int, McapRecord]]:
+        """Yield the records of all chunks, each with the offset of its chunk.
+
+        A damaged length may point beyond intact chunks. A chunk whose checksum is right has the right length.
+        After any other record, the next record must be plausible, or no intact chunk may follow.
+        """
+        at, size = len(MAGIC), len(data)
+        while at < size:
+            opcode, end = data[at], _end_of(data, at)
+            if opcode == Opcode.CHUNK and end is not None:
+                index = None if wanted is None else _indexed(data, end)
+                if wanted is not None and index is not None and not any(map(wanted, index)):
+                    at = end
+                    continue
+                content = self._read(data, at, end)
+                if content is not None:
+                    yield from ((at, item) for item in content)
+                    at = end
+                    continue
+            elif end is not None and (
+                (opcode not in _AT_THE_END and _is_plausible(data, end)) or _find_chunk(data, at + 1) == size
+            ):
+                if opcode in _AT_THE_END:
+                    return
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                    yield from ((at, item) for item in self._read(data, at, end) or ())
+                at = end
+                continue
+            following = _find_chunk(data, at + 1)
+            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage has been recorded
+                self.complain(at, "truncated" if following == size else "no record")
+            at = following
+
+    def _read(self, data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:
+        """Return the records in a chunk, or a record that is not in a chunk; None if it cannot be read."""
+        try:
+            record = _parsed(data[at], data[at + _HEAD.size : end])
+            if not isinstance(record, Chunk):
+                return [record]
+            if end - at != _HEAD.size + _CHUNK_HEAD.size + len(record.compression) + 8 + len(record.data):
+                raise ValueError("wrong length")
+            content: list[McapRecord] = breakup_chunk(_decompressed(record), validate_crc=True)
+        except Exception as error:  # the decompressors and the library raise various exceptions
+            self.complain(at, f"a record that cannot be read ({type(error).__name__}: {error})")
+            return None
+        return content
+
+
+def _open(path: Path) -> BinaryIO:
+    allowed = "an MCAP file"
+    try:
+        file = path.open("rb")
+        try:
+            if file.read(len(MAGIC)) == MAGIC:
+                return file
+        except OSError as error:
+            allowed = f"an MCAP file that can be read ({error.strerror})"
+        file.close()
+    except OSError as error:
+        allowed = f"a file that can be read ({error.strerror})"
+    raise ConfigError("recording", str(path), allowed) from None
+
+
+def _parsed(opcode: int, data: bytes) -> McapRecord:
+    stream = ReadDataStream(io.BytesIO(data))
+    record: McapRecord
+    match opcode:
+        case Opcode.CHUNK:
+            record = Chunk.read(stream)
+        case Opcode.SCHEMA:
+            record = Schema.read(stream)
+        case Opcode.CHANNEL:
+            record = Channel.read(stream)
+        case _:
+            record = Message.read(stream, len(data))
+    return record
+
+
+def _end_of(data: mmap.mmap, at: int) -> int | None:
+    """Return the offset after the record at ``at``; None if there is no complete record."""
+    if at + _HEAD.size > len(data):
+        return None
+    opcode, length = _HEAD.unpack_from(data, at)
+    known = 0 < opcode <= Opcode.DATA_END or opcode >= 0x80  # 0x80 and above are private records
+    end = int(at + _HEAD.size + length)
+    return end if known and end <= len(data) else None
+
+
+def _is_plausible(data: mmap.mmap, at: int) -> bool:
+    """Return whether the file ends at ``at``, or a complete record begins there."""
+    return at == len(data) or _end_of(data, at) is not None
+
+
+def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:
+    """Return the numbers of the channels in the message indexes after a chunk; None if there are none."""
+    found = set()
+    while (end := _end_of(data, at)) is not None and data[at] == Opcode.MESSAGE_INDEX:
+        if end < at + _HEAD.size + 2:
+            return None
+        found.add(int.from_bytes(data[at + _HEAD.size : at + _HEAD.size + 2], "little"))
+        at = end
+    return frozenset(found) or None
+
+
+def _find_chunk(data: mmap.mmap, at: int) -> int:
+    """Return the offset of the next complete chunk; the length of the file if there is none."""
+    while (at := data.find(bytes([Opcode.CHUNK]), at)) >= 0:
+        end = _end_of(data, at)
+        if end is not None and end >= at + _HEAD.size + _CHUNK_HEAD.size:
+            _, _, size, _, length = _CHUNK_HEAD.unpack_from(data, at + _HEAD.size)
+            word = at + _HEAD.size + _CHUNK_HEAD.size
+            if size <= _MOST_CHUNK and length <= 4 and data[word : word + length] in _COMPRESSIONS:
+                return at
+        at += 1
+    return len(data)
+
+
+def _decompressed(chunk: Chunk) -> Chunk:
+    """Return the chunk without compression. Raises ValueError if it would be larger than it claims."""
+    size, data = chunk.uncompressed_size, chunk.data
+    if size > _MOST_CHUNK:
+        raise ValueError(f"{size} bytes, must be at most {_MOST_CHUNK}")
+    if chunk.compression == "zstd":
+        import zstandard
+
+        if zstandard.frame_content_size(data) > size:
+            raise ValueError("contains more than it claims")
+        data = zstandard.decompress(data, max_output_size=size)
+    elif chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+    elif chunk.compression:
+        raise ValueError(f"unknown compression {chunk.compression[:20]!r}")
+    return replace(chunk, compression="", data=data)

@@ -1,0 +1,98 @@
+"""Reads the journal and the CAN frames of an MCAP file: a recording, or a ROS 2 bag with CAN frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skinnode.errors import ConfigError, Shown
+from skinnode.messages.can_frames import frame_of
+from skinnode.messages.definitions import (
+    CAN_FRAME,
+    DEFINITIONS,
+    FD_FRAME,
+    JOURNAL_LINE,
+    OURS,
+    version_of,
+)
+from skinnode.messages.typestore import decode, require_mcap
+from skinnode.record.mcap_file import BUS_KEY, SENT_KEY
+from skinnode.transport.frame_log import LoggedFrame
+from skinnode.transport.frame_log_reader import Damage
+
+if TYPE_CHECKING:
+    from mcap.records import Channel, Schema
+
+_RECEIVED_TOPICS = ("from_can_bus", "from_can_bus_fd")
+_SENT_TOPICS = ("to_can_bus", "to_can_bus_fd")
+"""Last part of the topics of ros2_socketcan."""
+
+
+class McapReader:
+    """Iterable over the CAN frames of an MCAP file. Frames have the name of their bus as channel.
+
+    Without the name of a bus, the channel is the namespace of the topics of ros2_socketcan, such as ``can0``
+    of ``/can0/from_can_bus``, or otherwise the topic.
+
+    Raises:
+        ConfigError: The file cannot be read, is not an MCAP file, or contains a newer version of our
+            messages; or a package of the extra mcap is missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require_mcap(str(path))
+        from skinnode.record.mcap_chunks import McapChunks
+
+        self.path = path
+        self._chunks = McapChunks(path, self._check)
+
+    @property
+    def damages(self) -> list[Damage]:
+        """First damaged parts of the file."""
+        return self._chunks.damages
+
+    @property
+    def damaged(self) -> int:
+        """Number of damaged parts found so far."""
+        return self._chunks.damaged
+
+    def close(self) -> None:
+        """Do nothing: the file is open only while it is read."""
+
+    def journal(self) -> Iterator[bytes]:
+        """Yield the lines of the journal."""
+        for item in self._chunks.messages((JOURNAL_LINE,), by_index=True):
+            try:
+                line: str = decode(item.message.data, JOURNAL_LINE).json
+            except ValueError as error:
+                line = f"{error}"
+            yield f"{line}\n".encode()
+
+    def __iter__(self) -> Iterator[LoggedFrame]:
+        for item in self._chunks.messages((CAN_FRAME, FD_FRAME)):
+            assert item.schema is not None  # selected by its name
+            bus, sent = _bus_of(item.channel)
+            try:
+                yield LoggedFrame(frame_of(item.message.data, item.schema.name), bus, sent)
+            except ValueError as error:
+                self._chunks.complain(item.offset, f"a message that cannot be read ({error})")
+
+    def _check(self, schema: Schema) -> None:
+        """Raise ConfigError if a message of ours has a newer version than this one."""
+        if not schema.name.startswith(OURS):
+            return
+        found = version_of(schema.data.decode("utf-8", "replace"))
+        known = version_of(DEFINITIONS.get(schema.name, ""))
+        if found is not None and known is not None and found > known:
+            allowed = f"version {known} or older; a newer skinnode can read this file"
+            raise ConfigError(schema.name, Shown(f"version {found}"), allowed, where=str(self.path))
+
+
+def _bus_of(channel: Channel) -> tuple[str, bool]:
+    """Return the bus of a channel's frames, and whether the recording program sent them."""
+    bus, sent = channel.metadata.get(BUS_KEY), channel.metadata.get(SENT_KEY)
+    parent, _, last = channel.topic.rpartition("/")
+    if bus is None:
+        bus = (parent.strip("/") or "/") if last in (*_RECEIVED_TOPICS, *_SENT_TOPICS) else channel.topic
+    return bus, last in _SENT_TOPICS if sent is None else sent == "1"

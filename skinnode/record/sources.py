@@ -1,0 +1,179 @@
+"""Opens recordings, and logs of other masters, for a replay or a conversion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
+from skinnode.host.hand_files import load_baseline
+from skinnode.host.node_facts import NodeFacts
+from skinnode.model.forward import resistance_ohm
+from skinnode.protocol.codes import CodeScale
+from skinnode.protocol.profile import PatchProfile
+from skinnode.record.journal import SUFFIX, Header, facts_table, parse_journal, read_journal
+from skinnode.record.log_files import channels
+from skinnode.record.mcap_file import MCAP
+from skinnode.record.mcap_reader import McapReader
+from skinnode.transport.frame_log import LoggedFrame
+from skinnode.transport.frame_log_reader import READABLE, Damage, FrameLogReader
+
+FRAME_FILES: Final = (*READABLE, MCAP)
+"""Suffixes of the files that can contain CAN frames."""
+ALLOWED: Final = f"a file ending in {', '.join(FRAME_FILES[:-1])} or {FRAME_FILES[-1]}"
+
+
+class Frames(Protocol):
+    """Iterable over the frames of a file, which skips damaged parts."""
+
+    path: Path
+
+    @property
+    def damages(self) -> list[Damage]:
+        """First damaged parts of the file."""
+
+    @property
+    def damaged(self) -> int:
+        """Number of damaged parts found so far."""
+
+    def __iter__(self) -> Iterator[LoggedFrame]:
+        """Yield the frames."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class ChannelMap:
+    """Buses of the channels in a file.
+
+    Args:
+        bus_of: Name of the bus of each channel.
+        only: If the first frame is on an unknown channel, its channel belongs to this bus, and no other
+            channel to any bus; None for no such rule.
+    """
+
+    def __init__(self, bus_of: dict[str, str], only: str | None = None) -> None:
+        self._bus_of, self._only = bus_of, only
+
+    def bus(self, channel: str) -> str | None:
+        """Return the name of the bus of a channel; None if the channel belongs to no bus of the hand."""
+        only, self._only = self._only, None
+        if only is not None and channel not in self._bus_of:
+            self._bus_of = {channel: only}
+        return self._bus_of.get(channel)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenRecording:
+    """Frames and journal of an open recording."""
+
+    frames: Frames
+    header: Header
+    events: list[dict[str, Any]]
+    complaints: list[str]
+    """One-line message for each unreadable part of the journal."""
+    lines: list[str]
+    """Lines of the journal; empty if there is none."""
+    journal: str
+    """Name of the file that contains the journal."""
+    channels: ChannelMap
+    foreign: bool = False
+    """Whether there is no journal, so that the header and the events were made from a hand file."""
+    notes: tuple[str, ...] = ()
+    """Assumptions that were made because there is no journal."""
+
+
+def open_recording(path: Path) -> OpenRecording:
+    """Open a recording with its journal.
+
+    Args:
+        path: File ending in .mcap; or file ending in .log, .blf or .asc with its journal in the same folder.
+
+    Raises:
+        ConfigError: The recording or its journal cannot be read.
+    """
+    if not path.name:
+        raise ConfigError("recording", str(path), ALLOWED)
+    if path.suffix == MCAP:
+        reader = McapReader(path)
+        raw = list(reader.journal())
+        if not raw:
+            allowed = "a recording of skinnode; for other MCAP files with CAN frames, also give --hand"
+            raise ConfigError("recording", str(path), allowed)
+        header, events, complaints = parse_journal(str(path), f"{path.name} journal", raw)
+        frames: Frames = reader
+        name, buses = f"{path.name} journal", {bus.name: bus.name for bus in header.hand.buses}
+    else:
+        journal = path.with_suffix(SUFFIX)
+        header, events, complaints, raw = read_journal(journal)
+        frames = FrameLogReader(path)
+        name, buses = journal.name, _channels_in(path, header.hand)
+    lines = [line.decode("utf-8", "replace").rstrip("\n") for line in raw]
+    return OpenRecording(frames, header, events, complaints, lines, name, ChannelMap(buses))
+
+
+def open_log(path: Path, hand: HandConfig) -> OpenRecording:
+    """Open a log without a journal, such as a candump log of a bus that another master runs.
+
+    The patches are decoded with the layouts, code widths and baselines of the hand file. A patch without a
+    baseline file is assumed to have the resistances of its undeformed layout at rest.
+
+    Args:
+        path: File with CAN frames.
+        hand: The hand. The channels of the log are matched with the names and the channels of its buses.
+
+    Raises:
+        ConfigError: The log or a baseline file cannot be read.
+    """
+    if not path.name:
+        raise ConfigError("recording", str(path), ALLOWED)
+    frames: Frames = McapReader(path) if path.suffix == MCAP else FrameLogReader(path)
+    guests = tuple(bus.model_copy(update={"role": "guest"}) for bus in hand.buses)
+    hand = hand.model_copy(update={"buses": guests})
+    events: list[dict[str, Any]] = []
+    notes = []
+    for patch in hand.patches:
+        profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
+        layout = patch.layout.build()
+        if patch.baseline is None:
+            baseline_ohm = resistance_ohm(layout, layout.upper_m)
+            notes.append(f"{patch.name}: no baseline file in the hand file; assumed the undeformed layout")
+        else:
+            baseline_ohm = load_baseline(patch.baseline, profile)
+        scale = CodeScale(patch.code_bits)
+        facts = NodeFacts(patch, layout, profile, scale, baseline_ohm, None, hand.bring_up.heartbeat_s)
+        events.append(
+            {
+                "bus": patch.bus,
+                "at": 0,
+                "t_ns": 0,
+                "event": "resumed",
+                "patch": patch.name,
+                "facts": facts_table(facts),
+                "line": 1 + len(events),
+            }
+        )
+    buses = _channels_in(path, hand)
+    if path.suffix != ".blf":
+        buses = {bus.channel: bus.name for bus in hand.buses} | {b.name: b.name for b in hand.buses} | buses
+    return OpenRecording(
+        frames=frames,
+        header=Header(hand, "", 0),
+        events=events,
+        complaints=[],
+        lines=[],
+        journal="hand file",
+        channels=ChannelMap(buses, hand.buses[0].name if len(hand.buses) == 1 else None),
+        foreign=True,
+        notes=tuple(notes),
+    )
+
+
+def _channels_in(path: Path, hand: HandConfig) -> dict[str, str]:
+    """Return the name of the bus of each channel in a log; BLF and ASC files number the channels."""
+    if path.suffix in (".blf", ".asc"):
+        return {str(number): bus.name for number, bus in enumerate(hand.buses)}
+    return {channel: bus for bus, channel in channels(hand).items()}

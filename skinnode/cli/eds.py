@@ -1,4 +1,4 @@
-"""``skinnode eds``: prints the electronic data sheet of a patch of any size, for another CANopen master."""
+"""``skinnode eds``: EDS or DCF of a patch of any size for another CANopen master, and C99 for firmware."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 from skinnode.cli._layout_option import HELP as LAYOUT_HELP
 
 if TYPE_CHECKING:
+    from skinnode.model.layout import PatchLayout
     from skinnode.protocol.profile import PatchProfile
 
 _DEFAULT_SIZES = {
@@ -53,14 +54,23 @@ def eds(
         Path | None,
         typer.Option("--output", "-o", help="Write to this file instead of stdout.", metavar="FILE"),
     ] = None,
+    c: Annotated[
+        Path | None,
+        typer.Option(
+            "--c",
+            help="Write the C99 kit of the patch, for a board or a foreign master, into this folder.",
+            metavar="FOLDER",
+        ),
+    ] = None,
 ) -> None:
-    """Print the EDS or the DCF of a patch (CiA 306).
+    """Print the EDS or the DCF of a patch (CiA 306), or write its C99 kit.
 
     The EDS of a patch depends only on the wire and electrode counts, the code width and --fd. The EDS files
-    of the reference patches are in eds/.
+    of the reference patches are in eds/. With --layout, the C99 kit also contains the electrode coordinates.
     """
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable, write_text
+    from skinnode.protocol.c_kit import kit_files
     from skinnode.protocol.eds_files import dcf_text, eds_text
 
     sizes = {
@@ -69,7 +79,7 @@ def eds(
         "--upper-electrodes": upper_electrodes,
         "--lower-electrodes": lower_electrodes,
     }
-    profile = _profile(
+    profile, electrodes = _patch(
         {name: size for name, size in sizes.items() if size is not None}, layout, code_bits, fd
     )
     if dcf and node_id is None:
@@ -79,6 +89,10 @@ def eds(
             raise ConfigError(
                 option, value, "only with --dcf, because an EDS does not describe a particular node"
             )
+    if c is not None:
+        _refuse_with_kit({"--dcf": dcf or None, "--output": output and str(output)})
+        _write_kit(c, kit_files(profile, electrodes))
+        return
     if output is not None:
         require_writable("--output", output)
     bitrate_bps = 1_000_000 if bitrate is None else bitrate
@@ -89,15 +103,47 @@ def eds(
         write_text("--output", output, text)
 
 
-def _profile(sizes: dict[str, int], layout: str | None, code_bits: int, fd: bool) -> PatchProfile:
+def _refuse_with_kit(others: dict[str, object]) -> None:
+    """Refuse options that have no effect with --c. ``others``: their values, None if not given."""
+    from skinnode.errors import ConfigError
+
+    for option, value in others.items():
+        if value is not None:
+            raise ConfigError(option, value, "not together with --c")
+
+
+def _write_kit(folder: Path, texts: dict[str, str]) -> None:
+    """Write the files of the C99 kit, and print where."""
+    from skinnode.errors import ConfigError
+    from skinnode.files.output_file import write_text
+    from skinnode.protocol.c_kit import may_replace
+
+    files = {folder / name: text for name, text in texts.items()}
+    try:
+        folder.mkdir(exist_ok=True)
+        foreign = next((file for file in files if not may_replace(file)), None)
+    except OSError as error:
+        raise ConfigError("--c", str(folder), f"a folder that can be written ({error.strerror})") from error
+    if foreign is not None:
+        raise ConfigError("--c", str(foreign), "no such file, or one that skinnode eds --c has written")
+    for file, text in files.items():
+        write_text("--c", file, text)
+    typer.echo(f"wrote {', '.join(file.name for file in files)} to {folder}")
+
+
+def _patch(
+    sizes: dict[str, int], layout: str | None, code_bits: int, fd: bool
+) -> tuple[PatchProfile, PatchLayout | None]:
+    """Return the profile of the patch, and its layout if one is given."""
     from skinnode.cli._layout_option import find_layout, import_from_here
     from skinnode.errors import ConfigError
     from skinnode.protocol.profile import PatchProfile
 
     if layout is None:
         rows, columns, upper, lower = (_DEFAULT_SIZES | sizes).values()
-        return PatchProfile(rows, columns, upper, lower, code_bits, bus="fd" if fd else "classic")
+        return PatchProfile(rows, columns, upper, lower, code_bits, bus="fd" if fd else "classic"), None
     if sizes:
         raise ConfigError(next(iter(sizes)), next(iter(sizes.values())), "only without --layout")
     import_from_here()
-    return PatchProfile.from_layout(find_layout(layout), code_bits, "fd" if fd else "classic")
+    electrodes = find_layout(layout)
+    return PatchProfile.from_layout(electrodes, code_bits, "fd" if fd else "classic"), electrodes

@@ -1,8 +1,9 @@
 """Conversion between resistances and the codes sent on the bus.
 
-A resistance R is encoded as the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). Codes from 0 to 2ⁿ − 4
-are measurements. The three codes above are reserved for over-range, short and open, in this order. A host
-decodes live streams with the compiled function ``skinnode.solve.wires.decode``.
+A resistance R is encoded as the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)), rounded from the exact
+value, with ties to the even code, so that every implementation can compute the same code. Codes from 0 to
+2ⁿ − 4 are measurements. The three codes above are reserved for over-range, short and open, in this order. A
+host decodes live streams with the compiled function ``skinnode.solve.wires.decode``.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Final
 
 import numpy as np
@@ -77,6 +79,15 @@ class CodeScale:
         """Difference in R/R0 between adjacent codes."""
         return (self.hi - self.lo) / self.steps
 
+    @functools.cached_property
+    def position_error(self) -> float:
+        """Bound of the rounding error of (R/R0 − lo) / step in double precision, codes.
+
+        R/R0 and its difference to ``lo`` are relative to ``hi``, the division and the step to the code. The
+        bound is twice the sum of these four errors.
+        """
+        return self.steps * (2.0 * self.hi / (self.hi - self.lo) + 2.0) * 2.0**-52
+
     @property
     def relative_std(self) -> float:
         """Standard deviation of the quantisation error of R/R0: step / √12."""
@@ -113,12 +124,37 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     resistance = np.asarray(resistance_ohm, dtype=np.float64)
     baseline = as_baseline(baseline_ohm)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        code = np.rint((resistance / baseline - scale.lo) / scale.step)
+        position = (resistance / baseline - scale.lo) / scale.step
+        code = np.rint(position)
+        near_tie = np.abs(position - code) > 0.5 - scale.position_error
+        if near_tie.any():
+            code = _round_exactly(code, near_tie, resistance, baseline, scale)
         measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
         codes = np.where(measured, code, scale.over_range)
         codes = np.where(resistance <= 0, scale.short, codes)
         codes = np.where(resistance < np.inf, codes, scale.open)  # false for NaN too
     return codes.astype(np.uint32)
+
+
+def _round_exactly(
+    code: Float, near_tie: NDArray[np.bool_], resistance: Float, baseline: Float, scale: CodeScale
+) -> Float:
+    """Return the codes, with those near a tie rounded in exact arithmetic.
+
+    Args:
+        code: rounded positions in the code range; any shape.
+        near_tie: mask of the positions for which double precision cannot decide how to round.
+        resistance: resistances, ohm; broadcastable to the shape of ``code``.
+        baseline: R0, ohm; broadcastable to the shape of ``code``.
+        scale: mapping of R/R0 to codes.
+    """
+    exact = np.array(code)
+    lo, steps_per_ratio = Fraction(scale.lo), scale.steps / (Fraction(scale.hi) - Fraction(scale.lo))
+    above, below = np.broadcast_to(resistance, exact.shape), np.broadcast_to(baseline, exact.shape)
+    for place in map(tuple, np.argwhere(near_tie)):
+        ratio = Fraction(float(above[place])) / Fraction(float(below[place]))
+        exact[place] = round((ratio - lo) * steps_per_ratio)
+    return exact
 
 
 def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple[Float, NDArray[np.bool_]]:

@@ -19,7 +19,7 @@ def eds_name(profile: PatchProfile) -> str:
 
 def eds_text(profile: PatchProfile) -> str:
     """Return the content of a patch's EDS, which depends only on the profile."""
-    return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
+    return render_eds(device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
@@ -40,10 +40,16 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
     name = eds_name(profile)
     file_name = f"{name.removesuffix('.eds')}-node{node_id}.dcf"
     device = Commissioning(node_id, bitrate_bps // 1000, f"patch {node_id}", name)
-    return render_eds(_device_info(profile, file_name), profile.objects(), device)
+    return render_eds(device_info(profile, file_name), profile.objects(), device)
 
 
-def _device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
+def device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
+    """Return the general information in the EDS or DCF of a patch.
+
+    Args:
+        profile: sizes of the patch.
+        file_name: name of the EDS or DCF.
+    """
     variant = ", PDO over CAN FD" if profile.bus == "fd" else ""
     return DeviceInfo(
         file_name=file_name,

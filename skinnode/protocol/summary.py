@@ -60,19 +60,20 @@ class Summary(NamedTuple):
 PHASES: Final = 3
 """Number of conversion phases, not counting 0. A phase can be compared only with the phase of the previous
 scan: after missed scans, it may have wrapped."""
-_PHASE_SHIFT: Final = 6
+PHASE_SHIFT: Final = 6
+"""Number of the lowest bit of the conversion phase in the flags."""
 
 _CHECKED: Final = int(SummaryFlag.CHECKED)  # ten times as fast to test as an enum flag
 
 
 def conversion_phase(flags: int) -> int:
     """Return the conversion phase from a summary's flags; 0 if the patch does not count its conversions."""
-    return flags >> _PHASE_SHIFT & 3
+    return flags >> PHASE_SHIFT & 3
 
 
 def conversion_flags(phase: int) -> SummaryFlag:
     """Return the summary flags that encode a conversion phase, 0 to 3."""
-    return SummaryFlag(phase << _PHASE_SHIFT)
+    return SummaryFlag(phase << PHASE_SHIFT)
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:

@@ -32,7 +32,7 @@ REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 
-LANGUAGES = ("python", "sh", "toml", "text")
+LANGUAGES = ("python", "sh", "toml", "text", "c")
 NOT_RUN = "not run in CI: "
 BY_CI, ON_VCAN = "run by .ci/run", "in CI on vcan0"
 PRINTS, PRINTS_EXACTLY = "prints", "prints, to the digit"

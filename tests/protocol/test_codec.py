@@ -61,6 +61,34 @@ def test_the_code_is_the_one_of_the_formula(scale: CodeScale, baseline: float, d
     assert encode(resistance, baseline, scale) == code
 
 
+@settings(deadline=None, max_examples=300)
+@given(
+    scale=st.just(CodeScale(16)) | st.just(CodeScale(24)) | scales(),
+    baseline=st.integers(1, 1 << 24) | st.floats(1e-2, 1e9),
+    nudge=st.sampled_from([0, 0, 1, -1, 5, -5]),
+    data=st.data(),
+)
+def test_between_two_codes_the_exact_value_decides(
+    scale: CodeScale, baseline: float, nudge: int, data: st.DataObject
+) -> None:
+    """Half a code from both, or by a few units in the last place of the resistance more or less."""
+    steps, known = (1 << scale.bits) - 4, Fraction(float(np.float32(baseline)))
+    lo, per_ratio = Fraction(scale.lo), steps / (Fraction(scale.hi) - Fraction(scale.lo))
+    tie = data.draw(st.integers(0, steps)) - Fraction(1, 2)
+    resistance = float((lo + tie / per_ratio) * known)
+    resistance += nudge * np.spacing(resistance)
+    if resistance > 0:
+        code = round((Fraction(resistance) / known - lo) * per_ratio)
+        assert encode(resistance, baseline, scale) == (code if 0 <= code <= steps else scale.over_range)
+
+
+def test_a_tie_that_double_precision_misses_goes_to_the_even_code() -> None:
+    """R/R0 = 1/4 + (2 k + 1) / (2 steps); nearly half of these are rounded to the odd code otherwise."""
+    steps, k = 65532, np.arange(0, 65532, 7)
+    resistance = steps + 2 * (2 * k + 1)
+    np.testing.assert_array_equal(encode(resistance, 4 * steps, CodeScale(16)), k + k % 2)
+
+
 @pytest.mark.parametrize(("bits", "stride"), [(16, 1), (24, 257)])
 def test_every_measurement_survives_decoding_and_encoding(bits: int, stride: int) -> None:
     scale = CodeScale(bits)

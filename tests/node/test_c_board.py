@@ -226,6 +226,17 @@ def test_each_flag_once(kit_of: KitOf, wire: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("wire", WIRES, ids=["u16", "u24", "fd-u16", "fd-u24"])
+def test_a_reserved_code_is_sent_whatever_the_threshold(kit_of: KitOf, wire: dict[str, Any]) -> None:
+    """From the top of the range to open and back: a change of fewer codes than the threshold."""
+    profile = dataclasses.replace(PatchProfile.from_layout(LAYOUT), **wire)
+    pair = Pair(kit_of(profile), profile, counts=True)
+    pair.do("policy", (1, 60_000, 0))
+    for factor in (1.2499, np.inf, np.inf, 1.2499, 1.2498):
+        pair.do("touch", [(1, 2, factor)])
+        pair.do("scan", None)
+
+
+@pytest.mark.parametrize("wire", WIRES, ids=["u16", "u24", "fd-u16", "fd-u24"])
 def test_chunks_that_the_bus_refuses_are_missing(kit_of: KitOf, wire: dict[str, Any]) -> None:
     profile = dataclasses.replace(PatchProfile.from_layout(LAYOUT), **wire)
     kit, codes = kit_of(profile), np.arange(21, dtype=np.uint32)

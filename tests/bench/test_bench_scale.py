@@ -42,6 +42,11 @@ def test_a_further_patch_takes_little_memory() -> None:
         tracemalloc.stop()
 
 
+def test_the_largest_hand_is_one_that_a_host_accepts() -> None:
+    hand = scale.hand_of(1000)  # the maximum of the option --patches
+    assert (len(hand.patches), len(hand.buses)) == (1000, 250)
+
+
 def test_large_hands_are_measured_for_fewer_scans() -> None:
     assert [scale.scans_of(patches, 20) for patches in (1, 200, 256, 1000)] == [20, 20, 15, 4]
     assert scale.scans_of(1000, 1) == 1

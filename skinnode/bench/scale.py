@@ -65,6 +65,8 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
         ``host_ms``), the numbers of measured ``scans`` and solved ``fields``, the ratio of virtual to real
         time (``faster``), and the resident memory of the process (``memory_mb``).
     """
+    for count in patches:  # refuse a hand that is too large before measuring for minutes
+        hand_of(count)
     measure(1, 1, 2)  # compile the kernels and fill the caches
     contact = [measure(FIXED, count, scans) for count in TOUCHED]
     changed = [measure(FIXED, count, scans, changed_only=True) for count in TOUCHED[:2]]

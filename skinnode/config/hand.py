@@ -21,8 +21,9 @@ from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
-MOST_BUSES: Final = 64
-"""Maximum number of buses of a hand; no machine has so many CAN interfaces."""
+MOST_BUSES: Final = 256
+"""Maximum number of buses of a hand; no machine has so many CAN interfaces, but simulated hands of a thousand
+patches have 250 buses."""
 
 
 class HandConfig(Table):

@@ -13,7 +13,7 @@ import skinnode as sk
 
 from .press import frame_ohm, hertz_press
 
-FURTHER = 10
+FURTHER = 5
 FURTHER_MB = 1.5
 """Limit per further patch of the reference layout, MB; 1.0 when it was set. Of the arrays of a solve, the
 covariance of the loads alone has 1.4 MB."""

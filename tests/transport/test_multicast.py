@@ -327,3 +327,13 @@ def test_a_group_of_ipv6() -> None:
         assert [frame.data for frame in received(theirs, 1)] == [b"first"]
         theirs.send(2, b"second")
         assert [frame.data for frame in received(ours, 1)] == [b"second"]
+
+
+def test_a_full_send_buffer_delays_frames_and_loses_none(config: BusConfig, port: CanPort) -> None:
+    """The buffer holds about four packets, which a network card may keep for a while."""
+    with CanPort(config) as theirs:
+        with socket.socket(fileno=os.dup(theirs.fileno())) as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+        for number in range(1000):
+            theirs.send(number, b"12345678")
+    assert [frame.can_id for frame in received(port, 1000)] == list(range(1000))

@@ -1,0 +1,355 @@
+"""Touch detector of one patch: decides frame by frame, before anything is solved, whether the skin is touched.
+
+A touch begins when the statistic of a frame, or of the mean of three frames, exceeds its threshold
+(:mod:`skinnode.solve.detect.touch_test`). It ends when the mean of four frames agrees with rest. Rest is
+known less and less well while the patch is touched, because the gains drift. A touch therefore ends in one of
+four ways:
+
+- the readings agree with rest as it was before the touch;
+- they have changed towards rest, and agree with it within the drift since then;
+- a small share of the touch remains and stays constant: the rubber creeps. The rest becomes an offset;
+- they have agreed with rest, within the drift, for half an hour.
+
+A press that is held does none of this for ten minutes, however slight it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.detect.slow_state import BLOCK, BLOCK_S, OFFSET_S, SlowState
+from skinnode.solve.detect.touch_kernel import (
+    COUNT,
+    KEPT,
+    LOWER,
+    MOTION,
+    UPPER,
+    WORST,
+    TouchArrays,
+    retest,
+    see_frame,
+)
+from skinnode.solve.detect.touch_test import MOST_VECTORS, TestedPatch, TouchTest, bounded_exp, log_odds
+
+ENOUGH: Final = 0.5
+"""Minimum share of usable readings; with fewer, the detector does not decide."""
+ODD_READING: Final = 6.0
+"""Change of a single reading, in standard deviations, above which a frame is solved and its data checked.
+Noise exceeds it in one of 1,700,000 frames of 300 readings."""
+ODD_WIRE: Final = 8.0
+"""Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data checked.
+Noise exceeds it in one of 25,000 frames or fewer."""
+TOUCHES_PER_S: Final = 1.0 / 60.0
+"""Prior rate of touches, 1/s, for the odds."""
+TOUCH_S: Final = 1.0
+"""Prior mean duration of a touch, s, for the odds."""
+RESIDUE: Final = 0.15
+"""Share of a touch's largest amplitude that may remain as creep."""
+RESIDUE_S: Final = 10.0
+"""Time without a change after which such a remainder is taken for creep, s."""
+FORGOTTEN_S: Final = 1800.0
+"""Time after which a touch that cannot be told from drift ends, s."""
+AVERAGED_S: Final = 1.0
+"""Time over which a touch is averaged, to notice a change, s."""
+NOISE_FRAMES: Final = 400
+"""Number of frames over which the noise is averaged."""
+NOISE_START: Final = 30
+"""Weight of the stated noise, in frames."""
+QUIETER: Final = 0.6
+"""Ratio of a touched frame's noise variance to the average, below which the average must be too large."""
+NOISE_STEP: Final = 1.25
+"""Largest ratio of a frame's noise variance to the average that enters the average."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchVerdict:
+    """Decision about a frame."""
+
+    touched: bool | None
+    """Whether the patch is touched; None if too few readings are usable."""
+    odds: float
+    """Odds of touch to no touch; see :attr:`skinnode.FieldFrame.touch_odds`."""
+    quiet: bool
+    """Whether the frame need not be solved: the patch is untouched and no reading is unusual."""
+
+
+class TouchDetector:
+    """Touch detector of one patch. Each stream needs its own instance. The constructor compiles the kernels.
+
+    Args:
+        layout: The patch.
+        baseline_ohm: (U, K) resistances at rest, ohm; readings without a positive one are ignored.
+        noise: (U, K) relative standard deviation of the readings, without quantization.
+        rounding: (U, K) relative standard deviation of the quantization error.
+        period_s: Scan period, s.
+        false_alarms_per_hour: Accepted number of false alarms in an hour.
+        gain_std: (U + K + 1,) standard deviation of the gains at the start; None for a fresh baseline.
+
+    Attributes:
+        touched: Whether the patch is touched, as of the last frame with enough readings.
+    """
+
+    def __init__(  # noqa: PLR0913 - the facts about a stream
+        self,
+        layout: PatchLayout,
+        baseline_ohm: Float,
+        noise: Float,
+        rounding: Float,
+        *,
+        period_s: float,
+        false_alarms_per_hour: float,
+        gain_std: Float | None = None,
+    ) -> None:
+        upper, lower = layout.shape
+        self._layout, self._own, self._rounding = layout, noise.copy(), rounding.copy()
+        self._period_s, self._rate = period_s, false_alarms_per_hour
+        self._gain_variance = None if gain_std is None else gain_std**2
+        self._known = np.isfinite(baseline_ohm) & (baseline_ohm > 0.0)
+        self._all_known = bool(self._known.all())
+        self._arrays = TouchArrays(
+            ohm=np.full((upper, lower), np.nan),
+            rest=np.where(self._known, baseline_ohm, 1.0),
+            weight=np.zeros((upper, lower)),
+            expected=np.zeros((upper, lower)),
+            recent=np.zeros((KEPT, upper * lower)),
+            products=np.zeros((KEPT, MOST_VECTORS)),
+            columns=np.zeros(lower),
+            counts=np.zeros(lower),
+            found=np.zeros(8),
+        )
+        self._factor = 1.0
+        self._prepare()
+        self._arrays.ohm[:] = self._arrays.rest
+        see_frame(self._arrays.table, self._test.rows, 0, 1)
+        retest(self._arrays.table, self._test.rows, 0, 1)
+        self.reset()
+
+    def _prepare(self) -> None:
+        """Make the slow state and the test for the present noise."""
+        sigma = np.hypot(self._factor * self._own, self._rounding)
+        # noise of half a code or more makes the quantization errors of successive frames independent
+        coded = self._rounding**2 / sigma**2
+        undithered = (self._factor * self._own) ** 2 < 3.0 * self._rounding**2
+        self._sigma = np.ascontiguousarray(sigma)
+        self._weight = np.where(self._known, 1.0 / sigma, 0.0)
+        self._least_noise = min(1.0, max(float(np.median(coded)), 1e-4))
+        block = max(BLOCK, round(BLOCK_S / self._period_s))
+        patch = TestedPatch(
+            self._layout,
+            self._sigma.tobytes(),
+            round(float(np.where(undithered, coded, 0.0).mean()), 3),
+            self._period_s,
+            self._rate,
+            block,
+        )
+        self._slow = SlowState(patch, self._gain_variance)
+        self._use_test()
+
+    def _use_test(self) -> None:
+        self._test: TouchTest = self._slow.test
+
+    def reset(self) -> None:
+        """Forget the stream; the patch counts as untouched and the baseline as fresh."""
+        self.touched = False
+        self._noise, self._noise_frames = 1.0, NOISE_START
+        self._at, self._frames = 0, 0
+        self._log_odds = -math.inf
+        self._clock = 0  # frames
+        self._crept_peak, self._crept_at, self._is_creep = 0.0, 0, False  # of the last touch that was no creep
+        self._slow.reset()
+        self._use_test()
+        self._arrays.expected[:] = 0.0
+
+    def set_noise_factor(self, factor: float) -> None:
+        """Multiply the stated noise without quantization by ``factor``; the state of the stream is kept."""
+        if factor == self._factor:
+            return
+        gains, expected, before = self._slow.gains, self._arrays.expected.copy(), self._sigma
+        self._factor = factor
+        self._prepare()
+        self._slow.carry_on(gains, expected * before / self._sigma)
+        self._arrays.expected[:] = self._slow.expected
+        self._noise, self._noise_frames, self._frames = 1.0, NOISE_START, 0
+        if self.touched:
+            self._begin_touch()
+
+    @property
+    def gains(self) -> Float:
+        """(U + K + 1,) relative errors of the readings of the upper and lower wires and of the patch."""
+        return -self._slow.gains
+
+    def see(
+        self,
+        ohm: Float,
+        valid: NDArray[np.bool_] | None = None,
+        noise: Float | None = None,
+    ) -> TouchVerdict:
+        """Decide about the next frame.
+
+        Args:
+            ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
+            valid: (U, K) bool, False for readings to be ignored; None if there are none.
+            noise: (U, K) relative noise of this frame with quantization, if it may be larger than usual.
+        """
+        its = self._arrays
+        its.ohm[:] = ohm
+        weight = self._weight
+        if noise is not None:
+            usable = self._known & (noise > 0.0) & (noise < math.inf)
+            weight = np.where(usable, 1.0 / np.maximum(noise, self._sigma), 0.0)
+        if valid is not None:
+            weight = np.where(valid, weight, 0.0)
+        its.weight[:] = weight
+        self._at = (self._at + 1) % KEPT
+        self._frames = min(self._frames + 1, KEPT)
+        self._clock += 1
+        see_frame(its.table, self._test.rows, self._at, self._frames)
+        found = its.found.tolist()
+        if found[COUNT] < ENOUGH * its.ohm.size:
+            self._frames = 0
+            self._slow.skip()
+            return TouchVerdict(None, bounded_exp(self._log_odds), False)
+        self._follow_noise(found)
+        variance = self._noise * (1.0 + self._slow.offset_share)
+        scaled = [each / variance for each in found[:3]]
+        complete = found[COUNT] == its.ohm.size
+        if self.touched:
+            self._follow_touch(scaled, variance)
+            quiet = False
+        else:
+            quiet = self._follow_rest(scaled, found, variance, complete)
+        return TouchVerdict(self.touched, bounded_exp(self._log_odds), quiet)
+
+    def _follow_noise(self, found: list[float]) -> None:
+        """Average the noise variance. In touched frames, motion adds to it."""
+        now = found[MOTION]
+        unsure = self._noise_frames < 2 * NOISE_START or now < QUIETER * self._noise
+        if now < 0.0 or (self.touched and not unsure):
+            return
+        limited = min(max(now, self._noise / NOISE_STEP), self._noise * NOISE_STEP)
+        self._noise_frames = min(self._noise_frames + 1, NOISE_FRAMES)
+        self._noise = max(self._noise + (limited - self._noise) / self._noise_frames, self._least_noise)
+
+    def _follow_rest(self, scaled: list[float], found: list[float], variance: float, complete: bool) -> bool:
+        """Process a frame of an untouched patch; return whether it need not be solved."""
+        test, its = self._test, self._arrays
+        self._update_odds(scaled[0])
+        if scaled[0] > test.onset[0] or scaled[1] > test.onset[1]:
+            self._begin_touch()
+            return False
+        doubt = scaled[0] > test.doubt[0] or scaled[1] > test.doubt[1]
+        if doubt:
+            changed = self._slow.skip()
+        else:
+            y = its.recent[self._at].reshape(its.ohm.shape)
+            present = None if complete else np.isfinite(its.ohm) & (its.ohm > 0.0) & (its.weight > 0.0)
+            changed = self._slow.collect(y, present, self._noise)
+        if changed:
+            self._change_test()
+        deviation = math.sqrt(variance)
+        odd = found[WORST] > ODD_READING * deviation
+        odd |= max(found[UPPER], found[LOWER]) > ODD_WIRE * max(variance, 1.0) + 4.0 * max(variance - 1.0, 0.0)
+        return not (doubt or odd)
+
+    def _change_test(self) -> None:
+        """Use the slow state's present expectation and test."""
+        its, slow = self._arrays, self._slow
+        its.recent += (its.expected - slow.expected).ravel()
+        its.expected[:] = slow.expected
+        self._use_test()
+        retest(its.table, self._test.rows, self._at, self._frames)
+
+    def _update_odds(self, statistic: float) -> None:
+        """Update the odds with T of one frame, by Bayes' rule in a chain of two states."""
+        begins = min(TOUCHES_PER_S * self._period_s, 0.5)
+        ends = min(self._period_s / TOUCH_S, 0.5)
+        odds = bounded_exp(self._log_odds)
+        prior = (1.0 - ends) / ends if odds == math.inf else (odds * (1.0 - ends) + begins) / (
+            odds * ends + 1.0 - begins
+        )
+        self._log_odds = log_odds(self._test, statistic) + math.log(prior)
+
+    # -- a touch ---------------------------------------------------------------------------------------
+
+    def _begin_touch(self) -> None:
+        its = self._arrays
+        self.touched = True
+        self._slow.discard()
+        self._peak, self._touch_frames = 0.0, 0
+        self._average = its.recent[self._at].copy()
+        self._still, self._lighter, self._like_rest = 0, True, 0
+
+    def _follow_touch(self, scaled: list[float], variance: float) -> None:
+        """Process a frame of a touched patch."""
+        slow, its, test = self._slow, self._arrays, self._test
+        slow.skip()
+        self._touch_frames += 1
+        mean = scaled[2] if self._frames == KEPT else math.inf
+        energy = mean / KEPT if self._frames == KEPT else scaled[0]
+        self._peak = max(self._peak, energy if self._frames == KEPT else 0.0)
+        later = slow.test
+        within_drift = mean
+        statistic = scaled[0]
+        if later is not test:
+            y = its.recent[self._at]
+            statistic = float(((later.rows @ y) ** 2).sum()) / variance
+            if self._frames == KEPT:
+                within_drift = float(((later.rows @ its.recent.sum(axis=0)) ** 2).sum()) / KEPT / variance
+        used, self._test = self._test, later
+        self._update_odds(statistic)
+        self._test = used
+        self._follow_change(variance, later)
+        if later.onset[1] < within_drift < math.inf:
+            self._lighter = False  # this cannot be drift; wait for the next change towards rest
+        self._like_rest = self._like_rest + 1 if within_drift < later.release else 0
+        seconds = self._period_s
+        if (
+            mean < test.release
+            or (self._lighter and within_drift < later.release)
+            or self._like_rest * seconds >= FORGOTTEN_S
+        ):
+            self._end_touch(None)
+        elif self._still * seconds >= RESIDUE_S and energy < self._residue(mean / KEPT):
+            self._end_touch(self._average.reshape(its.ohm.shape))
+
+    def _residue(self, energy: float) -> float:
+        """Return the energy that may remain of this touch, or of an earlier one whose creep it may be.
+
+        Args:
+            energy: Energy of the present frames, ‖mean z‖².
+        """
+        since_s = (self._clock - self._crept_at) * self._period_s
+        earlier = self._crept_peak * min(1.0, RESIDUE_S / max(since_s, 1e-9)) ** 2
+        self._is_creep = energy >= RESIDUE**2 * self._peak
+        return RESIDUE**2 * max(self._peak, earlier if since_s < OFFSET_S else 0.0)
+
+    def _follow_change(self, variance: float, later: TouchTest) -> None:
+        """Compare the last frames with the average of the touch before them, to notice a change."""
+        if self._frames < KEPT:
+            return
+        recent, average = self._arrays.recent, self._average
+        now = recent.mean(axis=0)
+        share = 1.0 / min(max(1.0, AVERAGED_S / self._period_s), self._touch_frames)
+        spread = variance * (1.0 / KEPT + share)
+        if float(((self._test.rows @ (now - average)) ** 2).sum()) > spread * self._test.change:
+            self._still = 0
+            lighter = float(((later.rows @ now) ** 2).sum()) < float(((later.rows @ average) ** 2).sum())
+            self._lighter = self._lighter or lighter
+        else:
+            self._still += 1
+        average += share * (recent[(self._at + 1) % KEPT] - average)
+
+    def _end_touch(self, residue: Float | None) -> None:
+        self.touched = False
+        self._slow.released(residue)
+        if residue is None or not self._is_creep:
+            self._crept_peak, self._crept_at = self._peak, self._clock
+        if residue is not None:
+            self._log_odds = -math.inf
+        self._change_test()

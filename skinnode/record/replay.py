@@ -340,7 +340,9 @@ class _Bus:
             self._solvers[name] = None
             try:
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
-                self._solvers[name] = ScanSolver(facts, replay.hand.solver, replay.clock)
+                self._solvers[name] = ScanSolver(
+                    facts, replay.hand.solver, replay.clock, period_s=replay.hand.sync.period_s
+                )
             except (KeyError, TypeError, OverflowError, ValueError) as error:
                 replay.complain(event, f"unusable facts about {name} ({type(error).__name__}: {error})")
         return self._solvers.get(name)

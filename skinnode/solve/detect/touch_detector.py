@@ -29,13 +29,14 @@ from skinnode.solve.detect.touch_kernel import (
     KEPT,
     LOWER,
     MOTION,
+    RATIO,
     UPPER,
     WORST,
     TouchArrays,
     retest,
     see_frame,
 )
-from skinnode.solve.detect.touch_test import MOST_VECTORS, TestedPatch, TouchTest, bounded_exp, log_odds
+from skinnode.solve.detect.touch_test import MOST_VECTORS, TestedPatch, TouchTest, bounded_exp, log_likelihood_ratio
 
 ENOUGH: Final = 0.5
 """Minimum share of usable readings; with fewer, the detector does not decide."""
@@ -119,15 +120,17 @@ class TouchDetector:
             expected=np.zeros((upper, lower)),
             recent=np.zeros((KEPT, upper * lower)),
             products=np.zeros((KEPT, MOST_VECTORS)),
+            residual=np.zeros(upper),
             columns=np.zeros(lower),
             counts=np.zeros(lower),
-            found=np.zeros(8),
+            found=np.zeros(9),
         )
         self._factor = 1.0
         self._prepare()
         self._arrays.ohm[:] = self._arrays.rest
-        see_frame(self._arrays.table, self._test.rows, 0, 1)
-        retest(self._arrays.table, self._test.rows, 0, 1)
+        self._at, self._frames = 0, 1
+        self._compute(1.0)
+        retest(self._arrays.table, self._test.rows, 0, 1)  # compile the kernels
         self.reset()
 
     def _prepare(self) -> None:
@@ -161,17 +164,24 @@ class TouchDetector:
         self._at, self._frames = 0, 0
         self._log_odds = -math.inf
         self._clock = 0  # frames
-        self._crept_peak, self._crept_at, self._is_creep = 0.0, 0, False  # of the last touch that was no creep
+        self._crept_peak, self._crept_at = 0.0, 0  # of the last touch that was not itself creep
         self._slow.reset()
         self._use_test()
         self._arrays.expected[:] = 0.0
 
-    def set_noise_factor(self, factor: float) -> None:
-        """Multiply the stated noise without quantization by ``factor``; the state of the stream is kept."""
-        if factor == self._factor:
+    def set_noise(self, factor: float, noise: Float | None = None) -> None:
+        """Change the noise; the state of the stream is kept.
+
+        Args:
+            factor: Factor by which the stated noise without quantization is multiplied.
+            noise: (U, K) stated noise; as before if None.
+        """
+        if factor == self._factor and noise is None:
             return
         gains, expected, before = self._slow.gains, self._arrays.expected.copy(), self._sigma
         self._factor = factor
+        if noise is not None:
+            self._own = noise.copy()
         self._prepare()
         self._slow.carry_on(gains, expected * before / self._sigma)
         self._arrays.expected[:] = self._slow.expected
@@ -183,6 +193,23 @@ class TouchDetector:
     def gains(self) -> Float:
         """(U + K + 1,) relative errors of the readings of the upper and lower wires and of the patch."""
         return -self._slow.gains
+
+    @property
+    def residual(self) -> Float:
+        """(U,) RMS relative change since rest of the readings of each upper wire in the last frame."""
+        return self._arrays.residual.copy()
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(U, K) mask of the readings used in the last frame."""
+        its = self._arrays
+        with np.errstate(invalid="ignore"):
+            return np.asarray((its.ohm > 0.0) & (its.ohm < math.inf) & (its.weight > 0.0))
+
+    @property
+    def complete(self) -> bool:
+        """Whether all readings of the last frame were used."""
+        return float(self._arrays.found[COUNT]) == self._arrays.ohm.size
 
     def see(
         self,
@@ -209,7 +236,7 @@ class TouchDetector:
         self._at = (self._at + 1) % KEPT
         self._frames = min(self._frames + 1, KEPT)
         self._clock += 1
-        see_frame(its.table, self._test.rows, self._at, self._frames)
+        self._compute(self._noise * (1.0 + self._slow.offset_share))
         found = its.found.tolist()
         if found[COUNT] < ENOUGH * its.ohm.size:
             self._frames = 0
@@ -218,13 +245,18 @@ class TouchDetector:
         self._follow_noise(found)
         variance = self._noise * (1.0 + self._slow.offset_share)
         scaled = [each / variance for each in found[:3]]
-        complete = found[COUNT] == its.ohm.size
         if self.touched:
             self._follow_touch(scaled, variance)
             quiet = False
         else:
-            quiet = self._follow_rest(scaled, found, variance, complete)
+            quiet = self._follow_rest(scaled, found, variance)
         return TouchVerdict(self.touched, bounded_exp(self._log_odds), quiet)
+
+    def _compute(self, variance: float) -> None:
+        test = self._test
+        see_frame(
+            self._arrays.table, test.rows, test.shares, test.log_dets, variance, self._at, self._frames
+        )
 
     def _follow_noise(self, found: list[float]) -> None:
         """Average the noise variance. In touched frames, motion adds to it."""
@@ -236,10 +268,10 @@ class TouchDetector:
         self._noise_frames = min(self._noise_frames + 1, NOISE_FRAMES)
         self._noise = max(self._noise + (limited - self._noise) / self._noise_frames, self._least_noise)
 
-    def _follow_rest(self, scaled: list[float], found: list[float], variance: float, complete: bool) -> bool:
+    def _follow_rest(self, scaled: list[float], found: list[float], variance: float) -> bool:
         """Process a frame of an untouched patch; return whether it need not be solved."""
         test, its = self._test, self._arrays
-        self._update_odds(scaled[0])
+        self._update_odds(found[RATIO])
         if scaled[0] > test.onset[0] or scaled[1] > test.onset[1]:
             self._begin_touch()
             return False
@@ -248,8 +280,7 @@ class TouchDetector:
             changed = self._slow.skip()
         else:
             y = its.recent[self._at].reshape(its.ohm.shape)
-            present = None if complete else np.isfinite(its.ohm) & (its.ohm > 0.0) & (its.weight > 0.0)
-            changed = self._slow.collect(y, present, self._noise)
+            changed = self._slow.collect(y, None if self.complete else self.used, self._noise)
         if changed:
             self._change_test()
         deviation = math.sqrt(variance)
@@ -265,15 +296,15 @@ class TouchDetector:
         self._use_test()
         retest(its.table, self._test.rows, self._at, self._frames)
 
-    def _update_odds(self, statistic: float) -> None:
-        """Update the odds with T of one frame, by Bayes' rule in a chain of two states."""
+    def _update_odds(self, log_ratio: float) -> None:
+        """Update the odds with the log likelihood ratio of a frame, by Bayes' rule in a chain of two states."""
         begins = min(TOUCHES_PER_S * self._period_s, 0.5)
         ends = min(self._period_s / TOUCH_S, 0.5)
         odds = bounded_exp(self._log_odds)
         prior = (1.0 - ends) / ends if odds == math.inf else (odds * (1.0 - ends) + begins) / (
             odds * ends + 1.0 - begins
         )
-        self._log_odds = log_odds(self._test, statistic) + math.log(prior)
+        self._log_odds = log_ratio + math.log(prior)
 
     # -- a touch ---------------------------------------------------------------------------------------
 
@@ -281,7 +312,7 @@ class TouchDetector:
         its = self._arrays
         self.touched = True
         self._slow.discard()
-        self._peak, self._touch_frames = 0.0, 0
+        self._peak, self._touch_frames, self._begun = 0.0, 0, self._clock
         self._average = its.recent[self._at].copy()
         self._still, self._lighter, self._like_rest = 0, True, 0
 
@@ -295,15 +326,12 @@ class TouchDetector:
         self._peak = max(self._peak, energy if self._frames == KEPT else 0.0)
         later = slow.test
         within_drift = mean
-        statistic = scaled[0]
+        log_ratio = float(its.found[RATIO])
         if later is not test:
-            y = its.recent[self._at]
-            statistic = float(((later.rows @ y) ** 2).sum()) / variance
+            log_ratio = log_likelihood_ratio(later, later.rows @ its.recent[self._at] / math.sqrt(variance))
             if self._frames == KEPT:
                 within_drift = float(((later.rows @ its.recent.sum(axis=0)) ** 2).sum()) / KEPT / variance
-        used, self._test = self._test, later
-        self._update_odds(statistic)
-        self._test = used
+        self._update_odds(log_ratio)
         self._follow_change(variance, later)
         if later.onset[1] < within_drift < math.inf:
             self._lighter = False  # this cannot be drift; wait for the next change towards rest
@@ -315,18 +343,13 @@ class TouchDetector:
             or self._like_rest * seconds >= FORGOTTEN_S
         ):
             self._end_touch(None)
-        elif self._still * seconds >= RESIDUE_S and energy < self._residue(mean / KEPT):
+        elif self._still * seconds >= RESIDUE_S and energy < self._residue():
             self._end_touch(self._average.reshape(its.ohm.shape))
 
-    def _residue(self, energy: float) -> float:
-        """Return the energy that may remain of this touch, or of an earlier one whose creep it may be.
-
-        Args:
-            energy: Energy of the present frames, ‖mean z‖².
-        """
-        since_s = (self._clock - self._crept_at) * self._period_s
+    def _residue(self) -> float:
+        """Return the energy that may remain of this touch, or of an earlier one whose creep it may be."""
+        since_s = (self._begun - self._crept_at) * self._period_s
         earlier = self._crept_peak * min(1.0, RESIDUE_S / max(since_s, 1e-9)) ** 2
-        self._is_creep = energy >= RESIDUE**2 * self._peak
         return RESIDUE**2 * max(self._peak, earlier if since_s < OFFSET_S else 0.0)
 
     def _follow_change(self, variance: float, later: TouchTest) -> None:
@@ -348,7 +371,7 @@ class TouchDetector:
     def _end_touch(self, residue: Float | None) -> None:
         self.touched = False
         self._slow.released(residue)
-        if residue is None or not self._is_creep:
+        if residue is None or RESIDUE**2 * self._peak >= self._residue():
             self._crept_peak, self._crept_at = self._peak, self._clock
         if residue is not None:
             self._log_odds = -math.inf

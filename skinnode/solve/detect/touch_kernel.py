@@ -16,7 +16,7 @@ KEPT: Final = 4
 """Number of frames kept for the means."""
 STATISTICS: Final = (1, 3, 4)
 """Numbers of frames of the means whose statistic is computed."""
-WORST, UPPER, LOWER, COUNT, MOTION = 3, 4, 5, 6, 7
+WORST, UPPER, LOWER, COUNT, MOTION, RATIO = 3, 4, 5, 6, 7, 8
 """Positions of the other results in ``found``."""
 
 
@@ -35,14 +35,16 @@ class TouchArrays(ArrayTable):
     """Unexpected changes of the last frames."""
     products: Annotated[NDArray[np.float64], "4 R"]
     """z = G y of the last frames; only the first columns are used if the test has fewer rows."""
+    residual: Annotated[NDArray[np.float64], "U"]
+    """RMS of ln(R₀/R) of each upper wire's readings; inf without any."""
     columns: Annotated[NDArray[np.float64], "K"]
     """Work array."""
     counts: Annotated[NDArray[np.float64], "K"]
     """Work array."""
-    found: Annotated[NDArray[np.float64], "8"]
+    found: Annotated[NDArray[np.float64], "9"]
     """Results: w ‖mean z‖² for w of 1, 3 and 4 frames; largest |y| of a reading; largest excess of χ² of an
     upper and of a lower wire, in standard deviations of χ²; number of readings used; noise variance from
-    three successive frames, in units of the stated variance, or −1."""
+    three successive frames, in units of the stated variance, or −1; log likelihood ratio of touch to no touch."""
 
 
 arrays_of = reader(TouchArrays)
@@ -68,13 +70,41 @@ def _norms(products: Float, size: int, at: int, frames: int, found: Float) -> No
         found[2] = four / 4.0
 
 
+@njit_part
+def _log_ratio(z: Float, size: int, shares: Float, log_dets: Float, variance: float) -> float:
+    """Return ln Σ exp ½ (Σ share z² / variance − log_det) over the octaves of depth."""
+    most, total = -np.inf, 0.0
+    for j in range(log_dets.size):
+        row, square = shares[j], 0.0
+        for i in range(size):
+            square += row[i] * z[i] * z[i]
+        term = 0.5 * (square / variance - log_dets[j])
+        if term > most:
+            total = total * np.exp(most - term) + 1.0
+            most = term
+        else:
+            total += np.exp(term - most)
+    return most + np.log(total)
+
+
 @njit
-def see_frame(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> None:
+def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
+    table: NDArray[np.int64],
+    rows: Float,
+    shares: Float,
+    log_dets: Float,
+    variance: float,
+    at: int,
+    frames: int,
+) -> None:
     """Compute the statistics of a frame.
 
     Args:
         table: Table of :class:`TouchArrays`.
         rows: (r, m) G of the test.
+        shares: (S, r) weights of the test's likelihood ratios.
+        log_dets: (S,) constants of the test's likelihood ratios.
+        variance: Noise variance of the stream, relative to the stated variance.
         at: Position of this frame in ``recent`` and ``products``.
         frames: Number of frames in ``recent``, including this one.
     """
@@ -87,7 +117,7 @@ def see_frame(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> No
     for k in range(lower):
         columns[k] = counts[k] = 0.0
     for u in range(upper):
-        total, here = 0.0, 0
+        total, moved, here = 0.0, 0.0, 0
         for k in range(lower):
             i = u * lower + k
             r, r0, w = ohm[u, k], rest[u, k], weight[u, k]
@@ -95,7 +125,9 @@ def see_frame(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> No
             if r > 0.0 and r < 1e300 and w > 0.0:
                 s = (r0 - r) / (r0 + r)  # ln(R₀/R) = 2 artanh s
                 s2 = s * s
-                value = 2.0 * s * (1.0 + s2 * (1.0 / 3.0 + s2 * (0.2 + s2 / 7.0))) * w - expected[u, k]
+                change = 2.0 * s * (1.0 + s2 * (1.0 / 3.0 + s2 * (0.2 + s2 / 7.0)))
+                moved += change * change
+                value = change * w - expected[u, k]
                 y[i] = value
                 square = value * value
                 total += square
@@ -108,6 +140,7 @@ def see_frame(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> No
                     motion += bend * bend
                     pairs += 1
         used += here
+        its.residual[u] = np.sqrt(moved / here) if here else np.inf
         if here:
             excess = max(excess, (total - here) / np.sqrt(2.0 * here))
     found[WORST], found[UPPER], found[COUNT] = np.sqrt(worst), excess, float(used)
@@ -120,6 +153,7 @@ def see_frame(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> No
     size = rows.shape[0]
     multiply_vector(rows, y, its.products[at, :size])
     _norms(its.products, size, at, frames, found)
+    found[RATIO] = _log_ratio(its.products[at], size, shares, log_dets, variance)
 
 
 @njit

@@ -3,14 +3,17 @@
 Let y = ln(R₀/R)/σ be the changes of the readings since rest, in units of their noise, after subtraction of
 the estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ covers the noise and the error of
 the gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
-response of the readings to loads at a typical depth. A touched frame therefore has y ~ N(0, V₀ + B Bᵀ), and
-the log odds are ½ (T − ln det(I + Bᵀ V₀⁻¹ B)) with
+response of the readings to loads at a depth that noise almost hides. A touched frame therefore has
+y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
     T = yᵀ (V₀⁻¹ − (V₀ + B Bᵀ)⁻¹) y
 
 With the eigenvectors u_i and eigenvalues μ_i of Bᵀ V₀⁻¹ B, T is the sum of the squares of z = G y, whose rows
 are g_i = (1 + μ_i)^−½ V₀⁻¹ B u_i. Without a touch, the z_i are independent with the variances d_i = μ_i / (1 +
 μ_i), so T has the distribution of :mod:`skinnode.solve.detect.weighted_chi_squared`.
+
+The odds of a touch allow for every depth c times as large, which replaces μ_i with c² μ_i. The log likelihood
+ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)), and all octaves of c are equally likely.
 
 The mean of w successive frames reveals a touch w times as clearly as one frame, because noise is independent
 from frame to frame. The error of the gains is not, so the mean has its own distribution and threshold.
@@ -30,9 +33,14 @@ from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.detect.gain_drift import GainFilter, gain_filter
 from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
-DEPTH: Final = 0.005
-"""RMS normal displacement of the loads in the alternative, in layer heights. Depths of 0.0025 to 0.01 detect
-almost equally well; 0.02 and more find fewer presses of 2 % of the layer height."""
+DEPTH: Final = 5.0
+"""RMS normal displacement of the loads in the alternative, in layer heights times the relative noise: 0.5 % of
+the layer height at a noise of 1e-3. There, depths of 0.25 % to 1 % detect almost equally well; depths of 2 %
+and more find fewer presses of 2 %."""
+DEEPEST: Final = 0.16
+"""Largest RMS normal displacement that the odds allow for, in layer heights."""
+SHALLOWEST: Final = 0.5
+"""Smallest one, relative to that of the alternative."""
 LEAST_WEIGHT: Final = 0.02
 """Minimum weight κ² λ of an eigenvector of the elastic prior in the test."""
 MOST_VECTORS: Final = 96
@@ -61,8 +69,10 @@ class TouchTest:
     """(r, m) G, by which the changes of the readings are multiplied."""
     weights: Float
     """(r,) variances d of z = G y without a touch."""
-    log_det: float
-    """ln det(I + Bᵀ V₀⁻¹ B)."""
+    shares: Float
+    """(S, r) c² μ / (1 + c² μ) / d for the S octaves of depth."""
+    log_dets: Float
+    """(S,) Σ ln(1 + c² μ), plus 2 ln S."""
     onset: tuple[float, ...]
     """Thresholds of w ‖mean z‖² for the windows w in :data:`WINDOWS`."""
     doubt: tuple[float, ...]
@@ -121,7 +131,7 @@ def touch_test(key: TestedPatch, drift: float, patch_drift: float, seconds: floa
     """
     gains, sigma = filter_of(key, drift, patch_drift), key.noise.ravel()
     covariance = gains.after(seconds)
-    b = _responses(key.layout, float(np.median(sigma))) * (np.median(sigma) / sigma)[:, None]
+    b = _responses(key.layout) * (np.median(sigma) / sigma)[:, None]
     effect = gains.effect
     # V₀⁻¹ x = x − H (P⁻¹ + Hᵀ H)⁻¹ Hᵀ x
     inner = np.linalg.inv(np.linalg.inv(covariance) + effect.T @ effect)
@@ -140,13 +150,16 @@ def touch_test(key: TestedPatch, drift: float, patch_drift: float, seconds: floa
         share = key.coded * (window - 1) + 1.0
         return np.maximum(np.linalg.eigvalsh(share * noise + window * by_gains), 1e-12)
 
+    octaves = np.arange(0.0, max(math.log2(DEEPEST / (DEPTH * np.median(sigma) * SHALLOWEST)), 0.0) + 1.0)
+    deeper = (SHALLOWEST * 2.0**octaves[:, None]) ** 2 * values
     of_windows = [weights_of(window) for window in WINDOWS]
     frames_per_alarm = 3600.0 / (key.period_s * key.false_alarms_per_hour)
     chance = 1.0 / (frames_per_alarm * len(WINDOWS))
     return TouchTest(
         rows=np.ascontiguousarray(rows),
         weights=weights,
-        log_det=float(np.log1p(values).sum()),
+        shares=deeper / (1.0 + deeper) / weights,
+        log_dets=np.log1p(deeper).sum(axis=1) + 2.0 * math.log(len(deeper)),
         onset=tuple(
             upper_quantile(each, min(chance * run, 0.1)) for each, run in zip(of_windows, RUNS, strict=True)
         ),
@@ -167,11 +180,11 @@ def _vectors(layout: PatchLayout) -> tuple[Float, Float]:
     return model.vectors_t[best].T, values[best]
 
 
-def _responses(layout: PatchLayout, sigma: float) -> Float:
-    """Return B (m, r) for readings with the relative noise ``sigma``."""
+def _responses(layout: PatchLayout) -> Float:
+    """Return B (m, r) for readings with equal noise."""
     vectors, values = _vectors(layout)
     height = float(np.median(_clearance(layout)))
-    kappa = DEPTH * height / sigma
+    kappa = DEPTH * height  # depth in pitches over the noise
     share = kappa * np.sqrt(values)
     kept = share**2 > min(LEAST_WEIGHT, 0.5 * float(share.max()) ** 2)
     return np.asarray(vectors[:, kept] * share[kept])
@@ -184,9 +197,11 @@ def _clearance(layout: PatchLayout) -> Float:
     return PatchProblem.of(layout).clearance
 
 
-def log_odds(test: TouchTest, statistic: float) -> float:
-    """Return the log likelihood ratio of touch to no touch of a frame with the given T."""
-    return 0.5 * (statistic - test.log_det)
+def log_likelihood_ratio(test: TouchTest, z: Float) -> float:
+    """Return the log likelihood ratio of touch to no touch of a frame with z = G y (r,)."""
+    terms = 0.5 * (test.shares @ (z * z) - test.log_dets)
+    most = float(terms.max())
+    return most + math.log(float(np.exp(terms - most).sum()))
 
 
 def bounded_exp(value: float) -> float:

@@ -190,6 +190,11 @@ class TouchDetector:
             self._begin_touch()
 
     @property
+    def test(self) -> TouchTest:
+        """Test in use."""
+        return self._test
+
+    @property
     def gains(self) -> Float:
         """(U + K + 1,) relative errors of the readings of the upper and lower wires and of the patch."""
         return -self._slow.gains

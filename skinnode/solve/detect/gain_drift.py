@@ -20,6 +20,8 @@ DRIFT: Final = 0.01
 shown its own, and of its steady drift."""
 PATCH_DRIFT: Final = 0.02
 """Standard deviation of the change of the patch's gain in an hour, as for :data:`DRIFT`. The temperature of a skin changes faster than its wires age."""
+MEASURED_S: Final = 2.0
+"""Interval over which the random walk of a stream is measured, s. Over this time, it includes a steady drift."""
 _SETTLED: Final = 1e-4
 """Relative change of the variance of the readings at which the recursion has reached the steady state."""
 _ROUNDS: Final = 2000
@@ -57,7 +59,8 @@ class GainFilter:
 
     def growth(self, seconds: float) -> Float:
         """Return the growth of the variance of each gain (U + K + 1,) in some seconds."""
-        return np.asarray(seconds * (self.walk + seconds * self.rate))
+        steady_s = max(seconds - MEASURED_S, 0.0)
+        return np.asarray(seconds * self.walk + steady_s**2 * self.rate)
 
 
 def gain_filter(

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
-from skinnode.solve.detect.gain_drift import DRIFT, PATCH_DRIFT
-from skinnode.solve.detect.touch_test import TestedPatch, TouchTest, filter_of, touch_test
+from skinnode.solve.detect.gain_drift import DRIFT, MEASURED_S, PATCH_DRIFT
+from skinnode.solve.detect.touch_test import PatchNoise, TouchTest, filter_of, touch_test
 
 BLOCK_S: Final = 0.25
 """Minimum duration of a block, s."""
@@ -33,8 +33,6 @@ MOST_LEVEL: Final = 12
 """Number of the greatest age for which a test is made; months."""
 FINER: Final = math.sqrt(2.0)
 """Ratio of the drifts for which tests are made."""
-APART_S: Final = 2.0
-"""Interval over which the drift of a stream is measured, s."""
 PRIOR: Final = 8.0
 """Number of independent measurements of the drift after which the stated drift no longer counts."""
 WITHIN_S: Final = 120.0
@@ -68,13 +66,13 @@ class SlowState:
         offset_share: Variance of the offsets' errors, relative to the noise variance.
     """
 
-    def __init__(self, patch: TestedPatch, start: Float | None = None) -> None:
+    def __init__(self, patch: PatchNoise, start: Float | None = None) -> None:
         self._patch, self._start = patch, start
         upper, lower = patch.layout.shape
         self.expected = np.zeros((upper, lower))
         self._block_s = patch.block * patch.period_s
         self._base = int(HELD_BACK * patch.block)
-        self._blocks_apart = max(1, round(APART_S / self._block_s))
+        self._blocks_apart = max(1, round(MEASURED_S / self._block_s))
         self._sum, self._seen = np.zeros((upper, lower)), np.zeros((upper, lower))
         unit = float(np.median(patch.noise))
         self._unit = unit

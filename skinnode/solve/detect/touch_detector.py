@@ -36,7 +36,7 @@ from skinnode.solve.detect.touch_kernel import (
     retest,
     see_frame,
 )
-from skinnode.solve.detect.touch_test import MOST_VECTORS, TestedPatch, TouchTest, bounded_exp, log_likelihood_ratio
+from skinnode.solve.detect.touch_test import MOST_VECTORS, PatchNoise, TouchTest, bounded_exp, log_likelihood_ratio
 
 ENOUGH: Final = 0.5
 """Minimum share of usable readings; with fewer, the detector does not decide."""
@@ -143,7 +143,7 @@ class TouchDetector:
         self._weight = np.where(self._known, 1.0 / sigma, 0.0)
         self._least_noise = min(1.0, max(float(np.median(coded)), 1e-4))
         block = max(BLOCK, round(BLOCK_S / self._period_s))
-        patch = TestedPatch(
+        patch = PatchNoise(
             self._layout,
             self._sigma.tobytes(),
             round(float(np.where(undithered, coded, 0.0).mean()), 3),

@@ -86,7 +86,7 @@ class TouchTest:
 
 
 @dataclass(frozen=True)
-class TestedPatch:
+class PatchNoise:
     """What the tests of a patch depend on, apart from the error of the gains."""
 
     layout: PatchLayout
@@ -109,7 +109,7 @@ class TestedPatch:
 
 
 @functools.lru_cache(maxsize=128)
-def filter_of(key: TestedPatch, drift: float, patch_drift: float) -> GainFilter:
+def filter_of(key: PatchNoise, drift: float, patch_drift: float) -> GainFilter:
     """Return the gain filter for a drift of the wires and of the patch, from a cache if possible.
 
     Both drifts are standard deviations of the change in an hour.
@@ -118,7 +118,7 @@ def filter_of(key: TestedPatch, drift: float, patch_drift: float) -> GainFilter:
 
 
 @functools.lru_cache(maxsize=256)
-def touch_test(key: TestedPatch, drift: float, patch_drift: float, seconds: float) -> TouchTest:
+def touch_test(key: PatchNoise, drift: float, patch_drift: float, seconds: float) -> TouchTest:
     """Return the test for gains that were last estimated ``seconds`` ago, from a cache if possible.
 
     A new test takes about 10 ms for the reference patch.

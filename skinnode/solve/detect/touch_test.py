@@ -32,6 +32,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.detect.gain_drift import GainFilter, gain_filter
 from skinnode.solve.detect.weighted_chi_squared import upper_quantile
+from skinnode.solve.posterior.load_cells import LoadCells
 
 DEPTH: Final = 5.0
 """RMS normal displacement of the loads in the alternative, in layer heights times the relative noise: 0.5 % of
@@ -49,10 +50,6 @@ WINDOWS: Final = (1, 3)
 """Numbers of frames whose mean is tested for the onset of a touch."""
 RELEASE_FRAMES: Final = 4
 """Number of frames whose mean is tested for the release of a touch."""
-RUNS: Final = (1.0, 1.7)
-"""Mean number of successive frames above the threshold, for each of :data:`WINDOWS`. A threshold may be
-exceeded so many times as often as a touch may be reported. Measured with ``skinnode bench accuracy --only
-detection``."""
 RELEASE_CHANCE: Final = 0.01
 """Probability that noise alone delays the release of a touch by a frame."""
 CHANGE_CHANCE: Final = 1e-6
@@ -160,9 +157,7 @@ def touch_test(key: PatchNoise, drift: float, patch_drift: float, seconds: float
         weights=weights,
         shares=deeper / (1.0 + deeper) / weights,
         log_dets=np.log1p(deeper).sum(axis=1) + 2.0 * math.log(len(deeper)),
-        onset=tuple(
-            upper_quantile(each, min(chance * run, 0.1)) for each, run in zip(of_windows, RUNS, strict=True)
-        ),
+        onset=tuple(upper_quantile(each, min(chance, 0.1)) for each in of_windows),
         doubt=tuple(upper_quantile(each, DOUBT_CHANCE) for each in of_windows),
         change=upper_quantile(weights, CHANGE_CHANCE),
         release=upper_quantile(weights_of(RELEASE_FRAMES), RELEASE_CHANCE),
@@ -180,21 +175,14 @@ def _vectors(layout: PatchLayout) -> tuple[Float, Float]:
     return model.vectors_t[best].T, values[best]
 
 
+@functools.lru_cache(maxsize=8)
 def _responses(layout: PatchLayout) -> Float:
     """Return B (m, r) for readings with equal noise."""
     vectors, values = _vectors(layout)
-    height = float(np.median(_clearance(layout)))
-    kappa = DEPTH * height  # depth in pitches over the noise
+    kappa = DEPTH * LoadCells.of(layout).height_m / layout.pitch_m  # depth in pitches over the noise
     share = kappa * np.sqrt(values)
     kept = share**2 > min(LEAST_WEIGHT, 0.5 * float(share.max()) ** 2)
     return np.asarray(vectors[:, kept] * share[kept])
-
-
-def _clearance(layout: PatchLayout) -> Float:
-    """Return the clearances (U, N) between the layers at rest, pitches."""
-    from skinnode.solve.wires.problem import PatchProblem
-
-    return PatchProblem.of(layout).clearance
 
 
 def log_likelihood_ratio(test: TouchTest, z: Float) -> float:

@@ -12,31 +12,24 @@ The false alarms are those of the detector itself, frame by frame, while the gai
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
+from skinnode.bench.detection_patch import FALSE_ALARMS_PER_HOUR, PERIOD_S, Patch, load_of
 from skinnode.bench.timing import machine
-from skinnode.bench.truth import Load, Press, Skin
-from skinnode.bench.trust_loads import draw
-from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.layout import PatchLayout
 from skinnode.process.clock import perf_counter
-from skinnode.solve.detect.touch_detector import TouchDetector
 from skinnode.text.json_values import plain
 
 PITCH_M: Final = 4e-3
-PERIOD_S: Final = 0.08
-"""Default scan period, s."""
-FALSE_ALARMS_PER_HOUR: Final = 0.1
 NOISE: Final = 1e-3
 LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
 DRIFTS: Final = ("steady", "walk")
 """Drifts of the gains of all wires: at a constant rate of 1 % an hour up or down, or as random walks with a
 standard deviation of 1 % after an hour."""
-DRIFT: Final = 0.01
 FAMILIES: Final = (
     ("blunt sphere", 0.01),
     ("blunt sphere", 0.02),
@@ -64,80 +57,6 @@ RAMPS_S: Final = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Durations in which a slow press reaches its depth, s."""
 HOLD_S: Final = 600.0
 DETECTOR_US: Final = 20.0
-
-
-@dataclass(eq=False)
-class Patch:
-    """A simulated patch with drifting gains, and its detector."""
-
-    layout: PatchLayout
-    noise: float
-    drift: str
-    rng: np.random.Generator
-    false_alarms_per_hour: float = FALSE_ALARMS_PER_HOUR
-
-    def __post_init__(self) -> None:
-        upper, lower = self.layout.shape
-        self.skin = Skin(self.layout)
-        self.rest_ohm = self.skin.rest_ohm
-        self.detector = TouchDetector(
-            self.layout,
-            self.rest_ohm,
-            np.full((upper, lower), self.noise),
-            np.zeros((upper, lower)),
-            period_s=PERIOD_S,
-            false_alarms_per_hour=self.false_alarms_per_hour,
-        )
-        self._upper, self._lower = np.zeros((upper, 1)), np.zeros(lower)
-        rate = DRIFT * PERIOD_S / 3600.0
-        self._rates = rate * self.rng.choice((-1.0, 1.0), (upper, 1)), rate * self.rng.choice((-1.0, 1.0), lower)
-        self._walk = DRIFT * math.sqrt(PERIOD_S / 3600.0)
-
-    def see(self, ohm: Float) -> bool:
-        """Pass the next frame to the detector; return whether it finds a touch."""
-        if self.drift == "steady":
-            self._upper += self._rates[0]
-            self._lower += self._rates[1]
-        elif self.drift == "walk":
-            self._upper += self._walk * self.rng.standard_normal(self._upper.shape)
-            self._lower += self._walk * self.rng.standard_normal(self._lower.shape)
-        noisy = ohm * (1.0 + self.noise * self.rng.standard_normal(ohm.shape))
-        return bool(self.detector.see(noisy * (1.0 + self._upper) * (1.0 + self._lower)).touched)
-
-    def rest(self, frames: int) -> None:
-        """Pass frames of the untouched patch."""
-        for _ in range(frames):
-            self.see(self.rest_ohm)
-
-    def settle(self) -> None:
-        """Let go for five seconds; forget the stream if the touch does not end, and learn its drift again."""
-        self.rest(64)
-        if self.detector.touched:
-            self.detector.reset()
-            self.rest(1500)
-
-    def pressed_ohm(self, load: Load, share: float = 1.0) -> Float:
-        """Return the resistances (U, K) under a load."""
-        return self.skin.resistance_ohm(self.skin.displacement_m((load,), share))
-
-
-def load_of(kind: str, depth: float, layout: PatchLayout, rng: np.random.Generator) -> Load:
-    """Choose a random load of one of the :data:`FAMILIES`.
-
-    Args:
-        kind: Kind of the load.
-        depth: Depth divided by the layer height.
-        layout: Patch to press.
-        rng: Random generator.
-    """
-    if kind == "small sphere":
-        return draw("sphere", layout, rng, depth)
-    if kind != "blunt sphere":
-        return draw(kind, layout, rng, depth)
-    contact = rng.uniform(1.5, 3.0) * layout.pitch_m
-    center = draw("sphere", layout, rng, depth).center_m
-    sunk = depth * layout.height_m
-    return Press(center, contact**2 / sunk, sunk)
 
 
 def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
@@ -213,7 +132,12 @@ def taps(seed: int, presses: int) -> list[dict[str, Any]]:
     """Return the share of short taps found, by their duration in scans."""
     rows = []
     patch = _patch(seed, "staggered", 0.5, NOISE, "steady")
-    for kind, depth in (("blunt sphere", 0.01), ("blunt sphere", 0.02), ("blunt sphere", 0.03), ("dent", 0.05)):
+    for kind, depth in (
+        ("blunt sphere", 0.01),
+        ("blunt sphere", 0.02),
+        ("blunt sphere", 0.03),
+        ("dent", 0.05),
+    ):
         for frames in TAPS:
             hits = 0
             for _ in range(presses):
@@ -269,7 +193,7 @@ def slow(seed: int) -> list[dict[str, Any]]:
                 for t in range(6000)
             ]
             last = max((t for t, each in enumerate(touched) if each), default=-1)
-            onsets = sum(now and not before for before, now in zip(touched, touched[1:], strict=False))
+            onsets = sum(now and not before for before, now in itertools.pairwise(touched))
             rows.append(
                 {
                     "what": "creep",
@@ -321,7 +245,12 @@ def roc(seed: int, presses: int) -> list[dict[str, Any]]:
     frames_per_hour = 3600.0 / PERIOD_S
     limits = np.array([upper_quantile(test.weights, chance) for chance in chances])
     rows = []
-    for kind, depth in (("blunt sphere", 0.01), ("blunt sphere", 0.02), ("dent", 0.02), ("small sphere", 0.05)):
+    for kind, depth in (
+        ("blunt sphere", 0.01),
+        ("blunt sphere", 0.02),
+        ("dent", 0.02),
+        ("small sphere", 0.05),
+    ):
         ones, threes, wires, matched = [], [], [], []
         for _ in range(max(presses, 100)):
             ohm = patch.pressed_ohm(load_of(kind, depth, patch.layout, rng))
@@ -343,7 +272,8 @@ def roc(seed: int, presses: int) -> list[dict[str, Any]]:
                 "one frame": [float(np.mean(np.array(ones) > limit)) for limit in limits],
                 "mean of three frames": [float(np.mean(np.array(threes) > limit)) for limit in limits],
                 "largest χ² of a wire": [
-                    float(np.mean(np.array(wires) > chdtri(float(lower), chance / upper))) for chance in chances
+                    float(np.mean(np.array(wires) > chdtri(float(lower), chance / upper)))
+                    for chance in chances
                 ],
                 "known load": [float(np.mean(np.array(matched) > -ndtri(chance))) for chance in chances],
             }
@@ -378,7 +308,9 @@ def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     for row in figures["found"]:
         if (row["kind"], row["depth"]) in REQUIRED:
             share = row["within"][WITHIN - 1]
-            what = f"{row['kind']} {row['depth']:.0%}, {row['layout']} h={row['height']:g}, {row['drift']} drift"
+            what = (
+                f"{row['kind']} {row['depth']:.0%}, {row['layout']} h={row['height']:g}, {row['drift']} drift"
+            )
             must.append(_must(what, share, f"at least {FOUND:.0%}", share >= FOUND))
     for row in figures["alarms"]:
         # three standard deviations of the expected number
@@ -400,57 +332,3 @@ def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
     return {"what": what, "value": value, "limit": limit, "reached": bool(reached), "absolute": False}
-
-
-def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
-    """Print the tables."""
-    _print_found(figures["found"], echo)
-    echo("\ntaps found, staggered h=0.5, noise 1e-3, by duration in scans")
-    for row in figures["taps"]:
-        echo(f"  {row['kind']:14}{row['depth']:5.0%}{row['scans']:4} scans{row['found']:7.0%}")
-    echo("\nslow presses, held presses and creep; staggered h=0.5, noise 1e-3 unless stated")
-    for row in figures["slow"]:
-        if row["what"] == "slow press":
-            at = "not found" if row["found_at"] is None else f"found at {row['found_at']:.1%}"
-            echo(f"  {row['depth']:.0%} of the layer height in {row['seconds']:g} s: {at}")
-        elif row["what"] == "held press":
-            kept = "touched throughout" if row["kept"] else "NOT touched throughout"
-            echo(f"  {row['depth']:.0%} held for 10 min, {row['drift']} drift: {kept}, {row['released_frames']} frames")
-        else:
-            echo(
-                f"  creep of 10 % of a 30 % press, time constant {row['constant_s']:g} s, noise "
-                f"{row['noise']:.0e}: touched for {row['touched_s']:.1f} s, {row['new_onsets']} new onsets"
-            )
-    echo("\nfalse alarms of the detector at rest")
-    for row in figures["alarms"]:
-        echo(
-            f"  noise {row['noise']:.0e}, {row['drift']:6} drift: {row['alarms']:4} in {row['hours']:g} h,"
-            f" {row['per_hour']:.2g} an hour, set {row['set_per_hour']:g}"
-        )
-    time = figures["time"]
-    echo(
-        f"\ndetector, in the fastest of 31 rounds: {time['median_us']:.1f} µs a frame (median), "
-        f"{time['mean_us']:.1f} µs (mean); mean in the median round {time['median_of_rounds_us']:.1f} µs"
-    )
-    echo("\nrequirements")
-    for row in figures["must"]:
-        reached = "reached" if row["reached"] else "NOT REACHED"
-        echo(f"  {row['what']:62}{row['value']:>8.3g}  {row['limit']:18}{reached}")
-
-
-def _print_found(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo(
-        f"\npresses found within 1, 2, 3 and 4 frames; noise {NOISE:.0e}, {FALSE_ALARMS_PER_HOUR:g} false alarms "
-        "an hour, all gains drift 1 % an hour"
-    )
-    echo(f"  {'layout':16}{'drift':8}{'load':14}{'depth':>6}{'signal':>8}{'1':>6}{'2':>6}{'3':>6}{'4':>6}{'release':>9}")
-    for row in rows:
-        shares = "".join(f"{share:6.0%}" for share in row["within"])
-        release = "-" if row["released_median"] is None else f"{row['released_median']:.0f}"
-        late = f"  {row['late']} not released" if row["late"] else ""
-        beyond = "  beyond reach" if row["signal"] < REACHABLE else ""
-        where = f"{row['layout']} h={row['height']:g}"
-        echo(
-            f"  {where:16}{row['drift']:8}{row['kind']:14}{row['depth']:6.0%}{row['signal']:8.1f}{shares}{release:>9}"
-            f"{late}{beyond}"
-        )

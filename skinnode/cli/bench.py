@@ -223,11 +223,12 @@ def accuracy(
 
 def _detection(json: Path | None, plot: Path | None, seed: int, presses: int, hours: float) -> None:
     from skinnode.bench import accuracy_detection as bench
+    from skinnode.bench.accuracy_detection_report import print_all
 
     _prepare(json, plot)
     figures = bench.run(seed, presses, hours)
     _print_machine(figures)
-    bench.print_all(figures, typer.echo)
+    print_all(figures, typer.echo)
     _write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.detection import draw

@@ -30,8 +30,9 @@ def host(
 ) -> None:
     """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
 
-    Onsets and releases of touches are reported when they happen. With --json, each patch has `contacts` (null before the first field): centroid, area, normal and
-    shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
+    Onsets and releases of touches are reported when they happen. With --json, each patch has `touched`,
+    `touch_odds` and `contacts` (null before the first field): centroid, area, normal and shear force with
+    standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
     pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
     reported errors, or a guest received no SYNC. The exit status is also 1 if a scan was torn or a frame was
     lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
@@ -90,7 +91,7 @@ def _note_touches(events: EventSubscription, report: Report) -> None:
 
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Collect the fields, report touches, and report every second, until the host is stopped or time is up."""
+    """Collect the fields, report touches as they happen and the host every second, until the end."""
     from skinnode.cli._host_report import Second
 
     start_s = time.monotonic()

@@ -29,8 +29,8 @@ class HealthEvent:
     subject: str
     """Name of a patch or bus, or ``host``."""
     what: str
-    """Type of the change: for example ``touched``, ``released``, a new condition, the name of an increased counter of
-    :class:`PatchHealth` or :class:`BusHealth`, or ``defects``.
+    """Type of the change: for example ``touched``, ``released``, a new condition, the name of an increased
+    counter of :class:`PatchHealth` or :class:`BusHealth`, or ``defects``.
     """
     text: str
     """Human-readable description of the change, without the subject."""

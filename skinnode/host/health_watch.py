@@ -55,7 +55,7 @@ class HealthWatch:
     Threads: a dedicated thread checks the health, from construction until :meth:`close`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what is watched
         self,
         patches: Callable[[], Mapping[str, PatchHealth]],
         buses: Callable[[], Mapping[str, BusHealth]],

@@ -166,8 +166,8 @@ class FieldFrame:
     readings are usable. A touch begins and ends once: it lasts until four scans on average agree with rest.
     Noise alone reports a touch ``false_alarms_per_hour`` times an hour at most."""
     touch_odds: float | None = None
-    """Odds of touch to no touch, given the readings of this scan and the odds after the scan before; inf if too
-    large for a float, None without detection. They are the ratio of two probability densities of the
+    """Odds of touch to no touch, given the readings of this scan and the odds after the scan before; inf if
+    too large for a float, None without detection. They are the ratio of two probability densities of the
     readings times the prior odds. Without a touch, the readings differ from rest by noise and by drift of the
     gains. With a touch, independent loads on all cells displace the skin as well; every octave of their
     depth, from one that noise hides to 16 % of the layer height (RMS), is equally likely. The prior is a

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import skinnode as sk
-from skinnode.bench.truth import Press, Skin
 from skinnode.bench.trust_loads import Dent
+from skinnode.bench.truth import Press, Skin
 from skinnode.solve.detect.touch_detector import TouchDetector
 
 NOISE, PERIOD_S = 1e-3, 0.08
@@ -162,7 +162,9 @@ def test_noise_that_is_not_as_stated_is_neither_a_touch_nor_hides_one() -> None:
 def test_the_odds_say_what_the_decision_says() -> None:
     stream = Stream()
     rng = stream.rng
-    quiet = [stream.detector.see(REST * (1.0 + NOISE * rng.standard_normal(REST.shape))).odds for _ in range(200)]
+    quiet = [
+        stream.detector.see(REST * (1.0 + NOISE * rng.standard_normal(REST.shape))).odds for _ in range(200)
+    ]
     assert np.quantile(quiet, 0.95) < 1.0
     pressed = stream.detector.see(sphere(0.3) * (1.0 + NOISE * rng.standard_normal(REST.shape)))
     assert pressed.touched

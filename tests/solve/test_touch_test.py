@@ -18,7 +18,9 @@ from skinnode.solve.detect.touch_test import (
 )
 
 NOISE = 1e-3
-LAYOUT = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_wires=15, lower_electrodes=5)
+LAYOUT = sk.PatchLayout.preset(
+    "staggered", upper_wires=5, upper_electrodes=5, lower_wires=15, lower_electrodes=5
+)
 
 
 def patch_of(rate: float = 0.1, noise: np.ndarray | None = None) -> PatchNoise:
@@ -111,7 +113,9 @@ def test_false_alarms_in_a_hundred_patch_hours_agree_with_the_stated_rate() -> N
 def test_gains_that_drift_longer_are_known_less_well() -> None:
     patch = patch_of()
     gains = filter_of(patch, 0.01, 0.02)
-    variances = [np.diag(gains.effect @ gains.after(s) @ gains.effect.T).mean() for s in (0.0, 1.0, 60.0, 3600.0)]
+    variances = [
+        np.diag(gains.effect @ gains.after(s) @ gains.effect.T).mean() for s in (0.0, 1.0, 60.0, 3600.0)
+    ]
     assert np.all(np.diff(variances) > 0)
     # an hour: 1 % each of an upper and a lower wire and 2 % of the patch, each as walk and as steady drift
     assert variances[-1] - variances[0] == pytest.approx(

@@ -22,9 +22,7 @@ def test_pairs_of_weights_are_a_sum_of_exponentials() -> None:
     """With each weight twice, P(T > x) = Σ_i exp(−x / 2 w_i) Π_{j ≠ i} w_i / (w_i − w_j)."""
     single = np.array([0.9, 0.6, 0.35, 0.2, 0.1, 0.04])
     for x in (2.0, 8.0, 20.0, 35.0):
-        exact = sum(
-            np.exp(-x / (2 * w)) * np.prod([w / (w - v) for v in single if v != w]) for w in single
-        )
+        exact = sum(np.exp(-x / (2 * w)) * np.prod([w / (w - v) for v in single if v != w]) for w in single)
         assert tail_probability(np.repeat(single, 2), x) == pytest.approx(exact, rel=0.03)
 
 

@@ -2,8 +2,9 @@
 
 The logarithm of each reading contains three gains: that of its upper wire, that of its lower wire, and that
 of the patch, which temperature changes. Each gain is a random walk. The filter estimates the gains from
-blocks of untouched frames, so its error is that of the steady state plus the drift since the last block. All
-variances are in units of the noise variance of a reading.
+blocks of untouched frames, so its error is that of the steady state plus the drift since the last block. Over
+minutes, a steady drift at an unknown rate outweighs the random walk: its variance grows with the square of
+the time. All variances are in units of the noise variance of a reading.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ DRIFT: Final = 0.01
 """Standard deviation of the change of a wire's gain in an hour: of its random walk, before the stream has
 shown its own, and of its steady drift."""
 PATCH_DRIFT: Final = 0.02
-"""Standard deviation of the change of the patch's gain in an hour, as for :data:`DRIFT`. The temperature of a skin changes faster than its wires age."""
+"""Standard deviation of the change of the patch's gain in an hour, as for :data:`DRIFT`. The temperature of a
+skin changes faster than its wires age."""
 MEASURED_S: Final = 2.0
-"""Interval over which the random walk of a stream is measured, s. Over this time, it includes a steady drift."""
+"""Interval over which the random walk of a stream is measured, s. Up to this time, it includes a steady
+drift."""
 _SETTLED: Final = 1e-4
 """Relative change of the variance of the readings at which the recursion has reached the steady state."""
 _ROUNDS: Final = 2000
@@ -51,7 +54,7 @@ class GainFilter:
         """
         measured = self.effect.T @ self.effect * self.frames
         after = np.linalg.inv(np.linalg.inv(covariance) + measured)
-        return after @ self.effect.T * self.frames, after
+        return np.asarray(after @ self.effect.T * self.frames), np.asarray(after)
 
     def after(self, seconds: float) -> Float:
         """Return the covariance of the gains some seconds after the last block of the steady state."""
@@ -63,9 +66,7 @@ class GainFilter:
         return np.asarray(seconds * self.walk + steady_s**2 * self.rate)
 
 
-def gain_filter(
-    sigma: Float, drift: float, patch_drift: float, frames: int, block_s: float
-) -> GainFilter:
+def gain_filter(sigma: Float, drift: float, patch_drift: float, frames: int, block_s: float) -> GainFilter:
     """Return the filter for one patch.
 
     Args:
@@ -87,7 +88,7 @@ def gain_filter(
     covariance, measured = np.diag(walk * 60.0), effect.T @ effect * frames
     visible = 0.0  # a gain of all upper wires equals one of all lower wires, so some variances always grow
     for _ in range(_ROUNDS):
-        covariance = np.linalg.inv(np.linalg.inv(covariance + np.diag(walk * block_s)) + measured)
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance + np.diag(walk * block_s)) + measured))
         before, visible = visible, float(np.einsum("ij,ji->", covariance, measured))
         if abs(visible - before) <= _SETTLED * visible:
             break

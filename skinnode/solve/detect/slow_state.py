@@ -180,7 +180,9 @@ class SlowState:
         covariance = self._filter.steady if self._covariance is None else self._covariance
         before = self._level
         walked = np.diag(self._filter.growth(self.age * self._patch.period_s))
-        self._level = max(self._level_for(covariance + walked), self._level if self._covariance is None else 0)
+        self._level = max(
+            self._level_for(covariance + walked), self._level if self._covariance is None else 0
+        )
         return self._level != before
 
     def discard(self) -> None:
@@ -292,7 +294,9 @@ class SlowState:
         """
         independent = self._weight / self._blocks_apart
         prior = max(0.0, 1.0 - independent / PRIOR) * self._blocks_apart
-        found = (prior * (stated / self._unit) ** 2 / 3600.0 + self._weight * measured) / (prior + self._weight)
+        found = (prior * (stated / self._unit) ** 2 / 3600.0 + self._weight * measured) / (
+            prior + self._weight
+        )
         found += 2.0 * std / math.sqrt(max(independent, 1.0))
         drift = max(self._unit * math.sqrt(3600.0 * max(found, 0.0)), self._floor)
         steps = max(math.floor(math.log(MOST_DRIFT * stated / drift) / math.log(FINER) + 1e-9), 0)

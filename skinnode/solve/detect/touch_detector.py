@@ -1,16 +1,7 @@
-"""Touch detector of one patch: decides frame by frame, before anything is solved, whether the skin is touched.
+"""Touch detector of one patch: decides before anything is solved whether the skin is touched.
 
 A touch begins when the statistic of a frame, or of the mean of three frames, exceeds its threshold
-(:mod:`skinnode.solve.detect.touch_test`). It ends when the mean of four frames agrees with rest. Rest is
-known less and less well while the patch is touched, because the gains drift. A touch therefore ends in one of
-four ways:
-
-- the readings agree with rest as it was before the touch;
-- they have changed towards rest, and agree with it within the drift since then;
-- a small share of the touch remains and stays constant: the rubber creeps. The rest becomes an offset;
-- they have agreed with rest, within the drift, for half an hour.
-
-A press that is held does none of this for ten minutes, however slight it is.
+(:mod:`skinnode.solve.detect.touch_test`). :mod:`skinnode.solve.detect.held_touch` decides when it has ended.
 """
 
 from __future__ import annotations
@@ -23,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.detect.held_touch import HeldTouch, creep_of
 from skinnode.solve.detect.slow_state import BLOCK, BLOCK_S, OFFSET_S, SlowState
 from skinnode.solve.detect.touch_kernel import (
     COUNT,
@@ -36,7 +28,13 @@ from skinnode.solve.detect.touch_kernel import (
     retest,
     see_frame,
 )
-from skinnode.solve.detect.touch_test import MOST_VECTORS, PatchNoise, TouchTest, bounded_exp, log_likelihood_ratio
+from skinnode.solve.detect.touch_test import (
+    MOST_VECTORS,
+    PatchNoise,
+    TouchTest,
+    bounded_exp,
+    log_likelihood_ratio,
+)
 
 ENOUGH: Final = 0.5
 """Minimum share of usable readings; with fewer, the detector does not decide."""
@@ -50,14 +48,6 @@ TOUCHES_PER_S: Final = 1.0 / 60.0
 """Prior rate of touches, 1/s, for the odds."""
 TOUCH_S: Final = 1.0
 """Prior mean duration of a touch, s, for the odds."""
-RESIDUE: Final = 0.15
-"""Share of a touch's largest amplitude that may remain as creep."""
-RESIDUE_S: Final = 10.0
-"""Time without a change after which such a remainder is taken for creep, s."""
-FORGOTTEN_S: Final = 1800.0
-"""Time after which a touch that cannot be told from drift ends, s."""
-AVERAGED_S: Final = 1.0
-"""Time over which a touch is averaged, to notice a change, s."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30
@@ -251,17 +241,15 @@ class TouchDetector:
         variance = self._noise * (1.0 + self._slow.offset_share)
         scaled = [each / variance for each in found[:3]]
         if self.touched:
-            self._follow_touch(scaled, variance)
+            self._follow_touch(variance)
             quiet = False
         else:
-            quiet = self._follow_rest(scaled, found, variance)
+            quiet = self._follow_rest(scaled, found)
         return TouchVerdict(self.touched, bounded_exp(self._log_odds), quiet)
 
     def _compute(self, variance: float) -> None:
         test = self._test
-        see_frame(
-            self._arrays.table, test.rows, test.shares, test.log_dets, variance, self._at, self._frames
-        )
+        see_frame(self._arrays.table, test.rows, test.shares, test.log_dets, variance, self._at, self._frames)
 
     def _follow_noise(self, found: list[float]) -> None:
         """Average the noise variance. In touched frames, motion adds to it."""
@@ -273,7 +261,7 @@ class TouchDetector:
         self._noise_frames = min(self._noise_frames + 1, NOISE_FRAMES)
         self._noise = max(self._noise + (limited - self._noise) / self._noise_frames, self._least_noise)
 
-    def _follow_rest(self, scaled: list[float], found: list[float], variance: float) -> bool:
+    def _follow_rest(self, scaled: list[float], found: list[float]) -> bool:
         """Process a frame of an untouched patch; return whether it need not be solved."""
         test, its = self._test, self._arrays
         self._update_odds(found[RATIO])
@@ -288,9 +276,7 @@ class TouchDetector:
             changed = self._slow.collect(y, None if self.complete else self.used, self._noise)
         if changed:
             self._change_test()
-        deviation = math.sqrt(variance)
-        odd = found[WORST] > ODD_READING * deviation
-        odd |= max(found[UPPER], found[LOWER]) > ODD_WIRE * max(variance, 1.0) + 4.0 * max(variance - 1.0, 0.0)
+        odd = found[WORST] > ODD_READING or max(found[UPPER], found[LOWER]) > ODD_WIRE
         return not (doubt or odd)
 
     def _change_test(self) -> None:
@@ -302,82 +288,40 @@ class TouchDetector:
         retest(its.table, self._test.rows, self._at, self._frames)
 
     def _update_odds(self, log_ratio: float) -> None:
-        """Update the odds with the log likelihood ratio of a frame, by Bayes' rule in a chain of two states."""
+        """Update the odds with a frame's log likelihood ratio, by Bayes' rule in a chain of two states."""
         begins = min(TOUCHES_PER_S * self._period_s, 0.5)
         ends = min(self._period_s / TOUCH_S, 0.5)
         odds = bounded_exp(self._log_odds)
-        prior = (1.0 - ends) / ends if odds == math.inf else (odds * (1.0 - ends) + begins) / (
-            odds * ends + 1.0 - begins
-        )
+        prior = (1.0 - ends) / ends
+        if odds < math.inf:
+            prior = (odds * (1.0 - ends) + begins) / (odds * ends + 1.0 - begins)
         self._log_odds = log_ratio + math.log(prior)
 
-    # -- a touch ---------------------------------------------------------------------------------------
-
     def _begin_touch(self) -> None:
-        its = self._arrays
         self.touched = True
         self._slow.discard()
-        self._peak, self._touch_frames, self._begun = 0.0, 0, self._clock
-        self._average = its.recent[self._at].copy()
-        self._still, self._lighter, self._like_rest = 0, True, 0
+        since_s = (self._clock - self._crept_at) * self._period_s
+        creep = creep_of(self._crept_peak, since_s) if since_s < OFFSET_S else 0.0
+        self._touch = HeldTouch(self._test, self._arrays.recent[self._at].copy(), self._period_s, creep)
 
-    def _follow_touch(self, scaled: list[float], variance: float) -> None:
+    def _follow_touch(self, variance: float) -> None:
         """Process a frame of a touched patch."""
-        slow, its, test = self._slow, self._arrays, self._test
+        its, slow = self._arrays, self._slow
         slow.skip()
-        self._touch_frames += 1
-        mean = scaled[2] if self._frames == KEPT else math.inf
-        energy = mean / KEPT if self._frames == KEPT else scaled[0]
-        self._peak = max(self._peak, energy if self._frames == KEPT else 0.0)
-        later = slow.test
-        within_drift = mean
-        log_ratio = float(its.found[RATIO])
-        if later is not test:
-            log_ratio = log_likelihood_ratio(later, later.rows @ its.recent[self._at] / math.sqrt(variance))
-            if self._frames == KEPT:
-                within_drift = float(((later.rows @ its.recent.sum(axis=0)) ** 2).sum()) / KEPT / variance
-        self._update_odds(log_ratio)
-        self._follow_change(variance, later)
-        if later.onset[1] < within_drift < math.inf:
-            self._lighter = False  # this cannot be drift; wait for the next change towards rest
-        self._like_rest = self._like_rest + 1 if within_drift < later.release else 0
-        seconds = self._period_s
-        if (
-            mean < test.release
-            or (self._lighter and within_drift < later.release)
-            or self._like_rest * seconds >= FORGOTTEN_S
-        ):
-            self._end_touch(None)
-        elif self._still * seconds >= RESIDUE_S and energy < self._residue():
-            self._end_touch(self._average.reshape(its.ohm.shape))
-
-    def _residue(self) -> float:
-        """Return the energy that may remain of this touch, or of an earlier one whose creep it may be."""
-        since_s = (self._begun - self._crept_at) * self._period_s
-        earlier = self._crept_peak * min(1.0, RESIDUE_S / max(since_s, 1e-9)) ** 2
-        return RESIDUE**2 * max(self._peak, earlier if since_s < OFFSET_S else 0.0)
-
-    def _follow_change(self, variance: float, later: TouchTest) -> None:
-        """Compare the last frames with the average of the touch before them, to notice a change."""
+        later, ratio = slow.test, float(its.found[RATIO])
+        if later is not self._test:
+            ratio = log_likelihood_ratio(later, later.rows @ its.recent[self._at] / math.sqrt(variance))
+        self._update_odds(ratio)
         if self._frames < KEPT:
             return
-        recent, average = self._arrays.recent, self._average
-        now = recent.mean(axis=0)
-        share = 1.0 / min(max(1.0, AVERAGED_S / self._period_s), self._touch_frames)
-        spread = variance * (1.0 / KEPT + share)
-        if float(((self._test.rows @ (now - average)) ** 2).sum()) > spread * self._test.change:
-            self._still = 0
-            lighter = float(((later.rows @ now) ** 2).sum()) < float(((later.rows @ average) ** 2).sum())
-            self._lighter = self._lighter or lighter
-        else:
-            self._still += 1
-        average += share * (recent[(self._at + 1) % KEPT] - average)
-
-    def _end_touch(self, residue: Float | None) -> None:
+        touch = self._touch
+        ended = touch.follow(its.recent, its.recent[(self._at + 1) % KEPT], variance, later)
+        if ended is False:
+            return
         self.touched = False
-        self._slow.released(residue)
-        if residue is None or RESIDUE**2 * self._peak >= self._residue():
-            self._crept_peak, self._crept_at = self._peak, self._clock
-        if residue is not None:
+        slow.released(touch.average.reshape(its.ohm.shape) if ended is None else None)
+        if ended or not touch.is_creep:
+            self._crept_peak, self._crept_at = touch.peak, self._clock
+        if ended is None:
             self._log_odds = -math.inf
         self._change_test()

@@ -42,9 +42,10 @@ class TouchArrays(ArrayTable):
     counts: Annotated[NDArray[np.float64], "K"]
     """Work array."""
     found: Annotated[NDArray[np.float64], "9"]
-    """Results: w ‖mean z‖² for w of 1, 3 and 4 frames; largest |y| of a reading; largest excess of χ² of an
-    upper and of a lower wire, in standard deviations of χ²; number of readings used; noise variance from
-    three successive frames, in units of the stated variance, or −1; log likelihood ratio of touch to no touch."""
+    """Results: w ‖mean z‖² for w of 1, 3 and 4 frames; largest |y| of a reading and largest excess of χ² of
+    an upper and of a lower wire, each in standard deviations; number of readings used; noise variance from
+    three successive frames, in units of the stated variance, or −1; log likelihood ratio of touch to no
+    touch."""
 
 
 arrays_of = reader(TouchArrays)
@@ -84,7 +85,8 @@ def _log_ratio(z: Float, size: int, shares: Float, log_dets: Float, variance: fl
             most = term
         else:
             total += np.exp(term - most)
-    return most + np.log(total)
+    found: float = most + np.log(total)
+    return found
 
 
 @njit
@@ -142,12 +144,12 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
         used += here
         its.residual[u] = np.sqrt(moved / here) if here else np.inf
         if here:
-            excess = max(excess, (total - here) / np.sqrt(2.0 * here))
-    found[WORST], found[UPPER], found[COUNT] = np.sqrt(worst), excess, float(used)
+            excess = max(excess, (total / variance - here) / np.sqrt(2.0 * here))
+    found[WORST], found[UPPER], found[COUNT] = np.sqrt(worst / variance), excess, float(used)
     excess = 0.0
     for k in range(lower):
         if counts[k] > 0.0:
-            excess = max(excess, (columns[k] - counts[k]) / np.sqrt(2.0 * counts[k]))
+            excess = max(excess, (columns[k] / variance - counts[k]) / np.sqrt(2.0 * counts[k]))
     found[LOWER] = excess
     found[MOTION] = motion / (6.0 * pairs) if pairs else -1.0
     size = rows.shape[0]

@@ -8,12 +8,13 @@ y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
     T = yᵀ (V₀⁻¹ − (V₀ + B Bᵀ)⁻¹) y
 
-With the eigenvectors u_i and eigenvalues μ_i of Bᵀ V₀⁻¹ B, T is the sum of the squares of z = G y, whose rows
-are g_i = (1 + μ_i)^−½ V₀⁻¹ B u_i. Without a touch, the z_i are independent with the variances d_i = μ_i / (1 +
-μ_i), so T has the distribution of :mod:`skinnode.solve.detect.weighted_chi_squared`.
+With the eigenvectors u_i and eigenvalues μ_i of Bᵀ V₀⁻¹ B, T is the sum of the squares of z = G y; the rows
+of G are g_i = (1 + μ_i)^−½ V₀⁻¹ B u_i. Without a touch, the z_i are independent with the variances d_i =
+μ_i / (1 + μ_i), so T has the distribution of :mod:`skinnode.solve.detect.weighted_chi_squared`.
 
-The odds of a touch allow for every depth c times as large, which replaces μ_i with c² μ_i. The log likelihood
-ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)), and all octaves of c are equally likely.
+The odds of a touch allow for every depth c times as large, which replaces μ_i with c² μ_i. The log
+likelihood ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)), and all octaves of c are
+equally likely.
 
 The mean of w successive frames reveals a touch w times as clearly as one frame, because noise is independent
 from frame to frame. The error of the gains is not, so the mean has its own distribution and threshold.
@@ -35,9 +36,9 @@ from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 from skinnode.solve.posterior.load_cells import LoadCells
 
 DEPTH: Final = 5.0
-"""RMS normal displacement of the loads in the alternative, in layer heights times the relative noise: 0.5 % of
-the layer height at a noise of 1e-3. There, depths of 0.25 % to 1 % detect almost equally well; depths of 2 %
-and more find fewer presses of 2 %."""
+"""RMS normal displacement of the loads in the alternative, in layer heights times the relative noise: 0.5 %
+of the layer height at a noise of 1e-3. There, depths of 0.25 % to 1 % detect almost equally well; depths of
+2 % and more find fewer presses of 2 %."""
 DEEPEST: Final = 0.16
 """Largest RMS normal displacement that the odds allow for, in layer heights."""
 SHALLOWEST: Final = 0.5
@@ -138,17 +139,17 @@ def touch_test(key: PatchNoise, drift: float, patch_drift: float, seconds: float
     rows = (whitened @ vectors / np.sqrt(1.0 + values)).T
     weights = values / (1.0 + values)
     by_gains = rows @ effect
-    by_gains = by_gains @ covariance @ by_gains.T
+    by_gains = np.asarray(by_gains @ covariance @ by_gains.T)
     noise = np.diag(weights) - by_gains
 
     def weights_of(window: int) -> Float:
         if window == 1:
             return weights
         share = key.coded * (window - 1) + 1.0
-        return np.maximum(np.linalg.eigvalsh(share * noise + window * by_gains), 1e-12)
+        return np.asarray(np.maximum(np.linalg.eigvalsh(share * noise + window * by_gains), 1e-12))
 
     octaves = np.arange(0.0, max(math.log2(DEEPEST / (DEPTH * np.median(sigma) * SHALLOWEST)), 0.0) + 1.0)
-    deeper = (SHALLOWEST * 2.0**octaves[:, None]) ** 2 * values
+    deeper = (SHALLOWEST * 2.0 ** octaves[:, None]) ** 2 * values
     of_windows = [weights_of(window) for window in WINDOWS]
     frames_per_alarm = 3600.0 / (key.period_s * key.false_alarms_per_hour)
     chance = 1.0 / (frames_per_alarm * len(WINDOWS))

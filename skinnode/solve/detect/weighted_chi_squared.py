@@ -37,7 +37,7 @@ def tail_probability(weights: Float, value: float) -> float:
     curvature = 2.0 * float(((weights / left) ** 2).sum())
     if abs(t) * mean < 1e-4:  # near the mean, where the formula is 0/0
         skewness = 8.0 * float((weights**3).sum()) / (2.0 * float((weights**2).sum())) ** 1.5
-        return 0.5 - skewness / (6.0 * math.sqrt(2.0 * math.pi))
+        return float(0.5 - skewness / (6.0 * math.sqrt(2.0 * math.pi)))
     w = math.copysign(math.sqrt(max(2.0 * (t * value - cumulant), 0.0)), t)
     u = t * math.sqrt(curvature)
     density = math.exp(-0.5 * w * w) / math.sqrt(2.0 * math.pi)

@@ -1,7 +1,7 @@
 """A touch from its onset on: decides when it has ended.
 
-Rest is known less and less well while the patch is touched, because the gains drift. A touch therefore ends in
-one of four ways:
+Rest is known less and less well while the patch is touched, because the gains drift. A touch therefore ends
+in one of four ways:
 
 - the readings agree with rest as it was at the onset;
 - they have changed towards rest, and agree with it within the drift since the onset;

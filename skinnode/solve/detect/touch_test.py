@@ -144,7 +144,7 @@ def touch_test(key: PatchNoise, drift: float, patch_drift: float, seconds: float
 
     def weights_of(window: int) -> Float:
         if window == 1:
-            return weights
+            return np.asarray(weights)
         share = key.coded * (window - 1) + 1.0
         return np.asarray(np.maximum(np.linalg.eigvalsh(share * noise + window * by_gains), 1e-12))
 

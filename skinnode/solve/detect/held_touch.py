@@ -13,7 +13,6 @@ A press that is held does none of this for ten minutes, however slight it is.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -109,6 +108,4 @@ def creep_of(peak: float, since_s: float) -> float:
     Creep slows down: in the first :data:`RESIDUE_S`, :data:`RESIDUE` of the amplitude may remain, afterwards
     less in inverse proportion to the time.
     """
-    return (
-        RESIDUE**2 * peak * min(1.0, RESIDUE_S / max(since_s, 1e-9)) ** 2 if math.isfinite(since_s) else 0.0
-    )
+    return peak * (RESIDUE * min(1.0, RESIDUE_S / max(since_s, 1e-9))) ** 2

@@ -25,7 +25,7 @@ RESIDUE: Final = 0.15
 RESIDUE_S: Final = 10.0
 """Time without a change after which such a remainder is taken for creep, s."""
 FORGOTTEN_S: Final = 1800.0
-"""Time after which a touch that cannot be told from drift ends, s."""
+"""Time after which a touch that looks no different from drift ends, s."""
 AVERAGED_S: Final = 1.0
 """Time over which a touch is averaged, to notice a change, s."""
 

@@ -118,6 +118,8 @@ class Tracker:
         The host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
+        if self._rest is not None:
+            self._rest.detector.prepare()
 
     def reset(self) -> None:
         """Discard the state of the stream; the solve of the next frame starts at the rest position."""

@@ -141,10 +141,6 @@ class RestGate:
             self.detector.set_noise(factor)
             self._field = None
 
-    def forget_field(self) -> None:
-        """Solve the next untouched frame again, because the method changed."""
-        self._field = None
-
     def _fits(self, noise: Float | None) -> bool:
         """Return whether the rest field has the usable readings and the noise of the last frame."""
         before = self._noise_of_field

@@ -48,6 +48,8 @@ TOUCHES_PER_S: Final = 1.0 / 60.0
 """Prior rate of touches, 1/s, for the odds."""
 TOUCH_S: Final = 1.0
 """Prior mean duration of a touch, s, for the odds."""
+PREPARED: Final = 6
+"""Number of tests made in advance, for touches of up to ten minutes."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30
@@ -102,7 +104,6 @@ class TouchDetector:
         self._period_s, self._rate = period_s, false_alarms_per_hour
         self._gain_variance = None if gain_std is None else gain_std**2
         self._known = np.isfinite(baseline_ohm) & (baseline_ohm > 0.0)
-        self._all_known = bool(self._known.all())
         self._arrays = TouchArrays(
             ohm=np.full((upper, lower), np.nan),
             rest=np.where(self._known, baseline_ohm, 1.0),
@@ -129,7 +130,8 @@ class TouchDetector:
         # noise of half a code or more makes the quantization errors of successive frames independent
         coded = self._rounding**2 / sigma**2
         undithered = (self._factor * self._own) ** 2 < 3.0 * self._rounding**2
-        self._sigma = np.ascontiguousarray(sigma)
+        # rounded, so that patches whose noise differs only by rounding errors share their tests
+        self._sigma = np.ascontiguousarray(sigma.astype(np.float32), np.float64)
         self._weight = np.where(self._known, 1.0 / sigma, 0.0)
         self._least_noise = min(1.0, max(float(np.median(coded)), 1e-4))
         block = max(BLOCK, round(BLOCK_S / self._period_s))
@@ -143,6 +145,11 @@ class TouchDetector:
         )
         self._slow = SlowState(patch, self._gain_variance)
         self._use_test()
+
+    def prepare(self) -> None:
+        """Make the tests that a stream needs in its first minutes; each takes about 15 ms."""
+        for level in range(PREPARED):
+            self._slow.test_at(level)
 
     def _use_test(self) -> None:
         self._test: TouchTest = self._slow.test

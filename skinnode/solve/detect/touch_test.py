@@ -115,7 +115,7 @@ def filter_of(key: PatchNoise, drift: float, patch_drift: float) -> GainFilter:
     return gain_filter(key.noise, drift, patch_drift, key.block, key.block * key.period_s)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def touch_test(key: PatchNoise, drift: float, patch_drift: float, seconds: float) -> TouchTest:
     """Return the test for gains that were last estimated ``seconds`` ago, from a cache if possible.
 

@@ -69,6 +69,18 @@ def test_the_field_at_rest_is_zero_and_says_so() -> None:
     np.testing.assert_allclose(field.residual, 1e-3, rtol=0.6)
 
 
+def test_the_deviations_at_rest_follow_the_noise_of_the_stream() -> None:
+    rng = np.random.default_rng(10)
+    follower = tracker(1e-4)
+    std = []
+    for noise in (1e-4, 1e-3):
+        for _ in range(80):
+            field = follower.update(REST * (1.0 + noise * rng.standard_normal(REST.shape)))
+        std.append(float(np.median(field.displacement_std_m)))
+        assert field.stats.evaluations == 0
+    assert std[1] > 3.0 * std[0]
+
+
 @pytest.mark.parametrize("noise", [1e-5, 1e-3])
 def test_a_reading_that_goes_wrong_at_rest_is_found(noise: float) -> None:
     """As it is without the detector, which at a noise of 1e-3 names the whole wire."""

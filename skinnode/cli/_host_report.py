@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Protocol
@@ -214,6 +215,8 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
         **trust_table(field),
         "noise_factor": field.noise_factor if field is not None else None,
         "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
+        "touched": field.touched if field is not None else None,
+        "touch_odds": _finite(field.touch_odds) if field is not None else None,
         **_deepest(field),
         "contacts": contact_tables(field),
     }
@@ -226,6 +229,11 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
     z = field.displacement_m[..., 2]
     figures = {"deepest_m": -z.min(), "deepest_std_m": field.displacement_std_m[..., 2].flat[z.argmin()]}
     return {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def _finite(value: float | None) -> float | None:
+    """Return the value as JSON can express it: the largest float for inf."""
+    return value if value is None or math.isfinite(value) else sys.float_info.max
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
@@ -270,6 +278,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
     if facts["solved"] and isinstance(deepest_m, float):
         std = f" ± {std_m * 1e6:.1f}" if isinstance(std_m, float) else ""
         deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
+        deepest = f"  touched{deepest}" if facts["touched"] else deepest
     worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
     trust = f"  untrusted: {facts['distrust']}" if facts["trusted"] is False else _doubts(facts)
     if facts["noise_factor"] not in (None, 1.0):

@@ -6,7 +6,7 @@ Ratios compare times from the same run, because absolute times depend on the mac
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -184,13 +184,27 @@ def accuracy(
         int, typer.Option(min=1, help="Number of random scenes per row of the coverage table.")
     ] = 200,
     rounds: Rounds = 31,
+    only: Annotated[
+        Literal["detection"] | None, typer.Option(help="Measure only the touch detector.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,
+    presses: Annotated[
+        int, typer.Option(min=1, help="Number of presses per row of the part `detection`.")
+    ] = 200,
+    hours: Annotated[
+        float, typer.Option(min=0.01, help="Patch-hours at rest in the part `detection`.")
+    ] = 100.0,
 ) -> None:
     """Measure the displacement error as a function of solve time, noise and code width.
 
-    The benchmark also measures the coverage of confidence intervals and the solve time per scan. The exit
-    status is 1 if a requirement is not met. No requirement limits a time, because times depend on
-    the machine.
+    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
+    `--only detection`, it measures which touches the detector finds, how soon, and its false alarms. The exit
+    status is 1 if a requirement is not met. No requirement limits a time, because times depend on the
+    machine.
     """
+    if only == "detection":
+        _detection(json, plot, seed, presses, hours)
+        return
     from skinnode.bench import accuracy as bench
 
     _prepare(json, plot)
@@ -200,6 +214,23 @@ def accuracy(
     _write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.accuracy import draw
+
+        draw(plot, figures)
+    if not all(row["reached"] or row["absolute"] for row in figures["must"]):
+        raise typer.Exit(1)
+
+
+def _detection(json: Path | None, plot: Path | None, seed: int, presses: int, hours: float) -> None:
+    from skinnode.bench import accuracy_detection as bench
+    from skinnode.bench.accuracy_detection_report import print_all
+
+    _prepare(json, plot)
+    figures = bench.run(seed, presses, hours)
+    _print_machine(figures)
+    print_all(figures, typer.echo)
+    _write(json, figures)
+    if plot is not None:
+        from skinnode.bench.plots.detection import draw
 
         draw(plot, figures)
     if not all(row["reached"] or row["absolute"] for row in figures["must"]):

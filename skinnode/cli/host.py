@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from skinnode.cli._host_report import Report
     from skinnode.config import HandConfig
     from skinnode.host import Host
+    from skinnode.host.events import EventSubscription
 
 _LONGEST_WAIT_S = 0.1
 """Maximum delay before the command reacts to Ctrl-C, s."""
@@ -29,8 +30,9 @@ def host(
 ) -> None:
     """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
 
-    With --json, each patch has `contacts` (null before the first field): centroid, area, normal and
-    shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
+    Onsets and releases of touches are reported when they happen. With --json, each patch has `touched`,
+    `touch_odds` and `contacts` (null before the first field): centroid, area, normal and shear force with
+    standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
     pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
     reported errors, or a guest received no SYNC. The exit status is also 1 if a scan was torn or a frame was
     lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
@@ -82,16 +84,25 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
     return 1 if faults else 0
 
 
+def _note_touches(events: EventSubscription, report: Report) -> None:
+    """Report the onsets and releases since the last call."""
+    while (event := events.get(0.0)) is not None:
+        if event.what in ("touched", "released"):
+            report.note(str(event))
+
+
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Collect the fields and report every second, until the host is stopped or the duration has elapsed."""
+    """Collect the fields, report touches as they happen and the host every second, until the end."""
     from skinnode.cli._host_report import Second
 
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     latencies_s: list[float] = []
+    events = running.events()
     with running.fields() as fields:
         before, due_s = running.stats(), start_s + 1.0
         while not stop.is_set():
+            _note_touches(events, report)
             now_s = time.monotonic()
             if now_s >= min(due_s, end_s):
                 now = running.stats()

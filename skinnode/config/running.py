@@ -52,6 +52,15 @@ class SolverConfig(Table):
     """Maximum standard deviation of the normal forces of contacts in a precise field, newtons. If None, the
     limit is derived from the layout and the properties of the rubber, and applies only to calibrated
     forces."""
+    detect: bool = True
+    """Detect touch before solving: reports ``touched``, and does not solve the scans of an untouched
+    patch."""
+    false_alarms_per_hour: Annotated[
+        float,
+        Field(ge=1e-6, le=1e4, allow_inf_nan=False),
+        Allowed("a number from 1e-6 to 1e4 (1/h)"),
+    ] = 0.1
+    """Accepted number of touches of each patch that noise alone reports in an hour."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel. If None, the host uses one thread per core, but at
     most one per patch."""

@@ -22,15 +22,15 @@ CAPACITY_EVENTS: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class HealthEvent:
-    """Change in the health of a patch, a bus or the host."""
+    """Change in the health of a patch, a bus or the host, or onset or release of a touch."""
 
     t_ns: int
-    """Monotonic time of the change, ns."""
+    """Monotonic time of the change, ns. For a touch, this is the time of the scan that showed the change."""
     subject: str
     """Name of a patch or bus, or ``host``."""
     what: str
-    """Type of the change: for example a new condition, the name of an increased counter of
-    :class:`PatchHealth` or :class:`BusHealth`, or ``defects``.
+    """Type of the change: for example ``touched``, ``released``, a new condition, the name of an increased
+    counter of :class:`PatchHealth` or :class:`BusHealth`, or ``defects``.
     """
     text: str
     """Human-readable description of the change, without the subject."""

@@ -1,4 +1,4 @@
-"""Watch the health of a running host, and publish changes as events."""
+"""Watch the health of a running host and the touches of its patches, and publish changes as events."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Final, Self
 from skinnode.host.containment import Defects, DefectStats, keep_on
 from skinnode.host.events import Events, HealthEvent
 from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.host.touch_changes import TouchChange
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.process import clock
 from skinnode.text.words import counted
@@ -49,22 +50,23 @@ def _is_frozen_part(fault: DataFault) -> bool:
 
 
 class HealthWatch:
-    """Publisher of the changes in the health of all patches and buses.
+    """Publisher of the changes in the health of all patches and buses, and of onsets and releases.
 
     Threads: a dedicated thread checks the health, from construction until :meth:`close`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what is watched
         self,
         patches: Callable[[], Mapping[str, PatchHealth]],
         buses: Callable[[], Mapping[str, BusHealth]],
         events: Events,
         defects: Defects | None = None,
         all_defects: Callable[[], Mapping[str, DefectStats]] = dict,
+        touches: Callable[[], list[TouchChange]] = list,
     ) -> None:
         self._patches, self._buses, self._events = patches, buses, events
         self._defects = Defects("host") if defects is None else defects
-        self._all_defects = all_defects
+        self._all_defects, self._touches = all_defects, touches
         self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
         # (subject, counter) -> time and counter value of the last event
@@ -97,12 +99,16 @@ class HealthWatch:
         if self._ended:
             return False
         self._ended = self._stop.wait(_CHECK_S)
-        for check in (self._check_patches, self._check_buses, self._check_defects):
+        for check in (self._check_touches, self._check_patches, self._check_buses, self._check_defects):
             try:
                 check()
             except Exception as error:
                 self._defects.report("watching the health", error)
         return True
+
+    def _check_touches(self) -> None:
+        for change in self._touches():
+            self._events.publish(HealthEvent(change.t_ns, change.patch, change.what, change.text))
 
     def _check_patches(self) -> None:
         for name, health in self._patches().items():

@@ -168,7 +168,12 @@ class Host:
         with running_parts(hand, options) as parts:
             host = cls(parts)
             with HealthWatch(
-                host._all_health, host._all_bus_health, parts.events, parts.defects, host._all_defects
+                host._all_health,
+                host._all_bus_health,
+                parts.events,
+                parts.defects,
+                host._all_defects,
+                parts.publisher.touches.take,
             ):
                 yield host
 
@@ -279,7 +284,7 @@ class Host:
         return bool(self.hand.sync.counter_overflow) or not any(each.stats().offered for each in streams)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to changes in the health of patches, wires and buses.
+        """Subscribe to touches, and to changes in the health of patches, wires and buses.
 
         Args:
             capacity: Queue length, in events. A full queue drops its oldest event.

@@ -15,6 +15,7 @@ from typing import Self
 from skinnode.errors import SkinError
 from skinnode.host.containment import Defects
 from skinnode.host.drop_oldest_queue import DropOldestQueue, End
+from skinnode.host.touch_changes import TouchChanges
 from skinnode.model.frames import FieldFrame
 
 
@@ -190,6 +191,9 @@ class Publisher:
     exception is reported to ``defects``.
 
     Threads: only workers may publish, one at a time per patch. Any thread may call the other methods.
+
+    Attributes:
+        touches: Onsets and releases of touches in the published fields.
     """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
@@ -199,6 +203,7 @@ class Publisher:
         self._subscriptions: dict[int, weakref.ref[Subscription]] = {}
         self._keys = itertools.count()
         self._last: End | None = None
+        self.touches = TouchChanges()
 
     def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
         """Create a subscription to the fields of one patch, or of all patches if ``patch`` is None.
@@ -236,6 +241,7 @@ class Publisher:
         Only the worker that is processing the patch may call this method.
         """
         self._latest[patch] = field
+        self.touches.on_field(field, patch)
         self._offer(field, patch)
 
     @property

@@ -133,7 +133,7 @@ class RemoteNode:
             why = f"one request got {count} responses: two nodes have node-ID {node_id} (see skinnode scan)"
             raise kind(node_id, f"{text}; {why}") from error
         try:
-            return ScanSolver(self.facts, self._hand.solver)
+            return ScanSolver(self.facts, self._hand.solver, period_s=self._hand.sync.period_s)
         except ValueError as error:  # the node's electrode layout is invalid
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
@@ -172,7 +172,7 @@ class RemoteNode:
         if (baseline_ohm == facts.baseline_ohm).all() and not self.stream.withholding:
             return None
         facts = facts.with_baseline(baseline_ohm)
-        solver = ScanSolver(facts, self._hand.solver)
+        solver = ScanSolver(facts, self._hand.solver, period_s=self._hand.sync.period_s)
         self.facts = facts  # not earlier: if creating the solver fails, the old baseline stays in use
         return solver
 

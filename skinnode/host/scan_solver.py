@@ -27,10 +27,16 @@ class ScanSolver:
         facts: Layout, code scale and baseline of the patch.
         config: Settings of the solver.
         now: Function that returns the monotonic time, ns.
+        period_s: SYNC period of the hand, s.
     """
 
     def __init__(
-        self, facts: NodeFacts, config: SolverConfig, now: Callable[[], int] = clock.monotonic_ns
+        self,
+        facts: NodeFacts,
+        config: SolverConfig,
+        now: Callable[[], int] = clock.monotonic_ns,
+        *,
+        period_s: float = 0.08,
     ) -> None:
         self.facts = facts
         self._now = now
@@ -47,7 +53,11 @@ class ScanSolver:
             gain=gain,
         )
         options = tracker_options(
-            facts.config, config, relative_noise=facts.config.relative_noise, baseline_ohm=facts.baseline_ohm
+            facts.config,
+            config,
+            relative_noise=facts.config.relative_noise,
+            baseline_ohm=facts.baseline_ohm,
+            period_s=period_s,
         )
         self._tracker = Tracker(facts.layout, options, codes=self._codes)
         self._tracker.prepare()
@@ -73,7 +83,12 @@ class ScanSolver:
 
 
 def tracker_options(
-    patch: PatchConfig, config: SolverConfig, *, relative_noise: float, baseline_ohm: Float | None = None
+    patch: PatchConfig,
+    config: SolverConfig,
+    *,
+    relative_noise: float,
+    baseline_ohm: Float | None = None,
+    period_s: float = 0.08,
 ) -> TrackerOptions:
     """Return the :class:`Tracker` options for the scans of a patch.
 
@@ -82,6 +97,7 @@ def tracker_options(
         config: Settings of the solver.
         relative_noise: Standard deviation of a resistance, relative to the resistance.
         baseline_ohm: (U, K) resistances at rest, ohm; None if not known yet.
+        period_s: SYNC period of the hand, s.
     """
     calibration = patch.calibration
     return TrackerOptions(
@@ -100,6 +116,9 @@ def tracker_options(
         normal_only=config.normal_only,
         max_std_m=config.max_std_m,
         max_force_std_n=config.max_force_std_n,
+        detect=config.detect,
+        false_alarms_per_hour=config.false_alarms_per_hour,
+        scan_period_s=period_s,
     )
 
 

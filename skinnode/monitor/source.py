@@ -193,7 +193,9 @@ class ReplaySource:
         self._running = ExitStack()
         self._all_events = events = Events()
         self._events: EventSubscription = events.subscribe(_EVENTS)
-        self._running.enter_context(HealthWatch(self._health, self._bus_health, events))
+        self._running.enter_context(
+            HealthWatch(self._health, self._bus_health, events, touches=run.publisher.touches.take)
+        )
         self._thread = threading.Thread(target=self._play, name="replay", daemon=True)
         self._thread.start()
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtCommand, NmtState
-from skinnode.config import BusConfig, SolverConfig
+from skinnode.config import BusConfig, HandConfig
 from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import BusStats, Dispatcher, PortCounters
 from skinnode.host.node_facts import NodeFacts
@@ -162,8 +162,10 @@ class ReplayedBus:
         return self._solvers.get(name)
 
     def _solver_of(self, facts: NodeFacts) -> ScanSolver:
-        config, now, kept = self._replay.hand.solver, self._replay.clock, self._replay.resistances
-        return ScanSolver(facts, config, now) if kept is None else _KeepingSolver(facts, config, now, kept)
+        replay, hand = self._replay, self._replay.hand
+        if replay.resistances is None:
+            return ScanSolver(facts, hand.solver, replay.clock, period_s=hand.sync.period_s)
+        return _KeepingSolver(facts, hand, replay.clock, replay.resistances)
 
 
 class _KeepingSolver(ScanSolver):
@@ -172,11 +174,11 @@ class _KeepingSolver(ScanSolver):
     def __init__(
         self,
         facts: NodeFacts,
-        config: SolverConfig,
+        hand: HandConfig,
         now: Callable[[], int],
         kept: deque[ResistanceFrame],
     ) -> None:
-        super().__init__(facts, config, now)
+        super().__init__(facts, hand.solver, now, period_s=hand.sync.period_s)
         self._kept = kept
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:

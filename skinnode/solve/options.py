@@ -129,6 +129,11 @@ class TrackerOptions(EstimateOptions):
             on the layout and the noise (:mod:`skinnode.solve.precision`).
         max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N. The
             default depends on the layout and the rubber, and applies only to calibrated forces.
+        detect: Whether to detect touch before solving (:mod:`skinnode.solve.detect`). An untouched patch is
+            then not solved, unless ``hold`` is off or ``estimate_noise`` is on.
+        false_alarms_per_hour: Accepted number of touches that noise alone reports in an hour.
+        scan_period_s: Time between two frames, s. The detector needs it for the drift of the gains and for
+            the number of false alarms.
 
     Raises:
         ValueError: If an option is out of range.
@@ -141,6 +146,9 @@ class TrackerOptions(EstimateOptions):
     codes: CodeMap | None = None
     max_std_m: float | None = None
     max_force_std_n: float | None = None
+    detect: bool = True
+    false_alarms_per_hour: float = 0.1
+    scan_period_s: float = 0.08
 
     def __post_init__(self) -> None:
         if self.method not in TRACKER_METHODS:
@@ -148,6 +156,8 @@ class TrackerOptions(EstimateOptions):
         for name, limit in (("max_std_m", self.max_std_m), ("max_force_std_n", self.max_force_std_n)):
             if limit is not None:
                 require_positive(name, limit)
+        require_positive("scan_period_s", self.scan_period_s)
+        require_positive("false_alarms_per_hour", self.false_alarms_per_hour)
         super().__post_init__()
 
     def of_posterior(self) -> PosteriorOptions:
@@ -202,6 +212,9 @@ class TrackerArguments(EstimateArguments, total=False):
     codes: CodeMap | None
     max_std_m: float | None
     max_force_std_n: float | None
+    detect: bool
+    false_alarms_per_hour: float
+    scan_period_s: float
 
 
 _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)

@@ -5,6 +5,9 @@ with an elastic prior. The default method, ``auto``, selects ``exact`` if the no
 ``posterior`` otherwise. The posterior also checks doubtful roots found by the exact method
 (:mod:`skinnode.solve.root_gate`).
 
+Before a frame is solved, a detector decides whether the patch is touched (:mod:`skinnode.solve.detect`). An
+untouched patch is not solved.
+
 The tracker estimates the noise of the stream and corrects the stated noise
 (:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker changes the method when the estimated noise
 crosses the limit for ``exact``. The new method starts at the rest position.
@@ -20,13 +23,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.frames import FieldFrame, amended
-from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.process.clock import perf_counter
 from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.cramer_rao import patch_std
+from skinnode.solve.detect.rest_gate import RestGate
 from skinnode.solve.exact.contacts import ExactContacts
 from skinnode.solve.exact.tracker import ExactTracker
-from skinnode.solve.inputs import checked_codes
+from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask
 from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
@@ -76,6 +80,7 @@ class Tracker:
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
+        self._rest = RestGate(layout, options) if options.detect else None
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
@@ -113,10 +118,14 @@ class Tracker:
         The host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
+        if self._rest is not None:
+            self._rest.detector.prepare()
 
     def reset(self) -> None:
         """Discard the state of the stream; the solve of the next frame starts at the rest position."""
         self._posterior.reset()
+        if self._rest is not None:
+            self._rest.reset()
         if self._exact is None:
             return
         self._exact.reset()
@@ -150,14 +159,20 @@ class Tracker:
             ValueError: If an argument has the wrong shape.
         """
         start = perf_counter()
+        if self._rest is not None:
+            ohm = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+            mask = None if valid is None else checked_mask(valid, self.layout)
+            noise = None if relative_noise is None else broadcast_noise(relative_noise, self.layout)
+            rest = self._at_rest(ohm, mask, noise)
+            if rest is not None:
+                return rest
         if self._exact is None or self.method == "posterior":
             field = self._posterior.update(frame_ohm, valid, relative_noise)
         else:
             field = self._exact.update(frame_ohm, valid, relative_noise, self._check.left_out)
             field = self._gate.check(field, start)
             field = self._checked(field, self._exact.arrays.ohm, start)
-        self._follow_noise()
-        return self._judged(field)
+        return self._finished(field)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
         """Compute the displacement field of a scan from its codes.
@@ -176,6 +191,11 @@ class Tracker:
         start, meaning = perf_counter(), self.options.codes
         if meaning is None:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
+        if self._rest is not None:
+            ohm, valid = meaning.decode(checked_codes(codes, self.layout))
+            rest = self._at_rest(ohm, valid, None, meaning)
+            if rest is not None:
+                return rest, valid.size - int(np.count_nonzero(valid))
         if self._exact is None or self.method == "posterior":
             ohm, valid = meaning.decode(checked_codes(codes, self.layout))
             noise, rounding_ohm = meaning.relative_noise, meaning.rounding_ohm
@@ -193,8 +213,7 @@ class Tracker:
                 ohm, valid = meaning.decode(codes)
                 invalid -= int(np.count_nonzero(left_out & valid))
                 field = self._checked(field, ohm, start)
-        self._follow_noise()
-        return self._judged(field), invalid
+        return self._finished(field), invalid
 
     @property
     def scan(self) -> int | None:
@@ -206,6 +225,36 @@ class Tracker:
         self._posterior.check.scan = number
         if self._exact is not None:
             self._check.scan = number
+
+    def _at_rest(
+        self, ohm: Float, valid: NDArray[np.bool_] | None, noise: Float | None, codes: CodeMap | None = None
+    ) -> FieldFrame | None:
+        """Pass a frame to the detector; return its field if it need not be solved, otherwise None."""
+        assert self._rest is not None
+        exact = self._exact is not None and self.method == "exact"
+        check = self._check if exact else self._posterior.check
+        field = self._rest.see(ohm, valid, noise, check.left_out)
+        if field is None:
+            return None
+        check.pass_frame()
+        stated = noise
+        if stated is None:
+            stated = broadcast_noise(
+                self.options.relative_noise if codes is None else codes.relative_noise, self.layout
+            )
+        rounding_ohm = None if codes is None else codes.rounding_ohm
+        if not exact:
+            self._posterior.see_noise(ohm, stated, rounding_ohm, valid)
+        elif self._noise is not None:
+            self._noise.see(ohm, stated, rounding_ohm, valid)
+        self._follow_noise()
+        return field
+
+    def _finished(self, field: FieldFrame) -> FieldFrame:
+        """Return the field of a solved frame with the results of the detector and its precision."""
+        self._follow_noise()
+        field = self._judged(field)
+        return field if self._rest is None else self._rest.add(field)
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
         """Test the readings of an exact field; return the field with its data faults and trust attributes."""
@@ -233,6 +282,9 @@ class Tracker:
         """Reconfigure the tracker if the noise estimate has changed."""
         if self._exact is not None and self._noise is not None and self._noise.factor != self._factor:
             self._adapt(self._noise)
+        noise = self._posterior.noise_estimate if self._exact is None else self._noise
+        if self._rest is not None and noise is not None:
+            self._rest.set_noise_factor(noise.factor)
 
     def _adapt(self, noise: NoiseEstimate) -> None:
         """Set the method and the thresholds of the root check for the estimated noise."""

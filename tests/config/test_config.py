@@ -124,6 +124,11 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             "name, buses, patches, links, sync, bring_up, solver, stream, simulation",
         ),
         (
+            ["solver", "false_alarms_per_hour"],
+            0,
+            "solver.false_alarms_per_hour: got 0, allowed: a number from 1e-6 to 1e4 (1/h)",
+        ),
+        (
             ["sync", "overflow"],
             240,
             "sync.overflow: got an unknown key, allowed: a key of this table "

@@ -13,6 +13,7 @@ from vcan_sim.fleet import Fleet
 from .conftest import eventually
 
 SCANS = 200
+OF_A_TOUCH = ("touched", "released")
 OF_THE_MACHINE = {"emergencies", "faulty", "stale", "operational"}
 """A simulator that is held up by other work is stale, and says that it skipped a scan (EMCY 0x8110)."""
 
@@ -35,7 +36,14 @@ def test_no_alarm_of_a_healthy_stream(
         while (event := events.get(0.0)) is not None:
             told.append(event)
         health = [host.health(patch.name) for patch in hand.patches]
-    assert [str(event) for event in told if event.what not in OF_THE_MACHINE] == []
+    alarms = [event for event in told if event.what not in (*OF_THE_MACHINE, *OF_A_TOUCH)]
+    assert [str(event) for event in alarms] == []
+    for patch in hand.patches:  # a press of 1 % or 50 % each second: onset and release, in turn
+        touches = [event for event in told if event.subject == patch.name and event.what in OF_A_TOUCH]
+        assert len(touches) >= 2
+        assert [event.what for event in touches] == [OF_A_TOUCH[i % 2] for i in range(len(touches))]
+        times = [event.t_ns for event in touches]
+        assert times == sorted(times)
     for patch in health:
         assert patch.wires == ()
         assert patch.conflicts == patch.rejoins == 0

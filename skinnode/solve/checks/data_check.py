@@ -159,6 +159,10 @@ class DataCheck:
         """(U, K) mask of the readings to leave out of the next frame; None if there are none."""
         return self._list.mask
 
+    def pass_frame(self) -> None:
+        """Count a frame that is not checked, because the patch is untouched."""
+        self._frame += 1
+
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:

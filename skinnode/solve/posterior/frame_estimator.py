@@ -255,12 +255,9 @@ class FrameEstimator:
         frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         noise = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
         mask = None if valid is None else checked_mask(valid, self.layout)
-        estimate = self.noise_estimate
-        if estimate is not None:
-            if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the trusted field was solved with a different noise
-            if estimate.factor != 1.0:
-                noise = estimate.factor * noise
+        self.see_noise(frame, noise, rounding_ohm, mask)
+        if self.noise_estimate is not None and self.noise_estimate.factor != 1.0:
+            noise = self.noise_estimate.factor * noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             a = frame * self._problem.gain
             if rounding_ohm is not None:
@@ -271,6 +268,11 @@ class FrameEstimator:
         if mask is not None:
             usable &= mask
         return Readings(np.where(usable, a, self._problem.a_rest), noise, usable)
+
+    def see_noise(self, ohm: Float, noise: Float, rounding_ohm: Float | None, valid: Mask | None) -> None:
+        """Pass a frame to the noise estimate; the arguments are those of :meth:`NoiseEstimate.see`."""
+        if self.noise_estimate is not None and self.noise_estimate.see(ohm, noise, rounding_ohm, valid):
+            self._seen = np.zeros_like(self._seen)  # the trusted field was solved with a different noise
 
     def _observe(self, readings: Readings) -> Observation:
         return self._model.observe(readings, self._hyper.noise_factor)

@@ -1,0 +1,177 @@
+"""Gate between the touch detector and the solvers: an untouched patch is not solved.
+
+The field of an untouched patch is zero. Its standard deviations, statuses and trust are those of the last
+solved frame that was untouched, converged and trusted, with the same usable readings and the same noise. The
+gate opens for every frame that is touched, doubtful, or contains an unusual reading or wire, so that the data
+check examines it. The gate stays open while readings are left out because of a fault.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.frames import FieldFrame, SolveStats, amended
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.status import Status
+from skinnode.process.clock import perf_counter
+from skinnode.solve.detect.touch_detector import TouchDetector, TouchVerdict
+from skinnode.solve.inputs import broadcast_noise
+from skinnode.solve.options import TrackerOptions
+from skinnode.solve.wires.problem import PatchProblem
+
+NOISIER: Final = 1.25
+"""Ratio of a frame's noise to that of the detector above which the detector is adapted to the frame."""
+SAME: Final = 0.1
+"""Relative difference in noise up to which a rest field stays valid."""
+
+
+class RestGate:
+    """Detector of one patch, and its field at rest. Each stream needs its own instance.
+
+    Args:
+        layout: The patch.
+        options: Options of the tracker.
+
+    Attributes:
+        detector: Touch detector of the patch.
+    """
+
+    def __init__(self, layout: PatchLayout, options: TrackerOptions) -> None:
+        problem = PatchProblem.of(layout, options.baseline_ohm)
+        noise, codes = np.array(broadcast_noise(options.relative_noise, layout)), options.codes
+        rounding = np.zeros(layout.shape)
+        if codes is not None:
+            noise = np.full(layout.shape, codes.relative_noise)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                relative = codes.rounding_ohm / codes.baseline_ohm
+            rounding = np.where(np.isfinite(relative), relative, 0.0)
+        self._drift, self._gates = options.drift, options.hold and not options.estimate_noise
+        self.detector = TouchDetector(
+            layout,
+            problem.a_rest / problem.gain,
+            noise,
+            rounding,
+            period_s=options.scan_period_s,
+            false_alarms_per_hour=options.false_alarms_per_hour,
+            gain_std=_gain_std(layout, options),
+        )
+        self._factor = 1.0
+        self._stated, self._layout = float(np.median(noise)), layout
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self.detector.reset()
+        self._verdict = TouchVerdict(None, 0.0, False)
+        self._field: FieldFrame | None = None
+        self._used: NDArray[np.bool_] | None = None
+        self._noise_of_field: Float | None = None
+        self._noise: Float | None = None
+
+    def see(
+        self,
+        ohm: Float,
+        valid: NDArray[np.bool_] | None,
+        noise: Float | None,
+        left_out: NDArray[np.bool_] | None,
+    ) -> FieldFrame | None:
+        """Return the field of a frame that need not be solved; None if it must be solved.
+
+        Args:
+            ohm: (U, K) resistances, ohm.
+            valid: (U, K) bool, False for missing readings; None if there are none.
+            noise: (U, K) relative noise of this frame; None for the stated noise.
+            left_out: (U, K) bool, True for faulty readings; None if there are none.
+        """
+        start = perf_counter()
+        if left_out is not None:
+            valid = ~left_out if valid is None else valid & ~left_out
+        if noise is not None:
+            self._adapt(noise)
+            noise = self._factor * noise
+        self._noise = noise
+        self._verdict = self.detector.see(ohm, valid, noise)
+        field = self._field
+        if not self._verdict.quiet or field is None or left_out is not None or not self._fits(noise):
+            return None
+        gain = field.gain
+        if gain is not None:
+            errors, wires = self.detector.gains, len(field.status)
+            gain = errors[:wires] + float(errors[wires:-1].mean() + errors[-1])
+            gain = gain if self._drift == "wire" else np.full(wires, gain.mean())
+        return amended(
+            field,
+            residual=self.detector.residual,
+            stats=SolveStats(0, 0, 0, perf_counter() - start),
+            gain=gain,
+            touched=self._verdict.touched,
+            touch_odds=self._verdict.odds,
+        )
+
+    def add(self, field: FieldFrame) -> FieldFrame:
+        """Return the field of the solved frame with ``touched`` and ``touch_odds``."""
+        verdict = self._verdict
+        if (
+            self._gates
+            and verdict.quiet
+            and field.trusted
+            and not field.faults
+            and all(status is Status.CONVERGED for status in field.status)
+            and (self._field is None or not self._fits(self._noise) or self._field.method != field.method)
+        ):
+            self._field = amended(
+                field,
+                displacement_m=np.zeros_like(field.displacement_m),
+                force_n=None if field.force_n is None else np.zeros_like(field.force_n),
+                contacts=(),
+                held=np.ones(len(field.status), np.bool_),
+            )
+            self._used = None if self.detector.complete else self.detector.used
+            self._noise_of_field = self._noise
+        return amended(field, touched=verdict.touched, touch_odds=verdict.odds)
+
+    def set_noise_factor(self, factor: float) -> None:
+        """Set the factor of the stated noise; the next untouched frame is solved again."""
+        if factor != self._factor:
+            self._factor = factor
+            self.detector.set_noise(factor)
+            self._field = None
+
+    def _fits(self, noise: Float | None) -> bool:
+        """Return whether the rest field has the usable readings and the noise of the last frame."""
+        before = self._noise_of_field
+        if (noise is None) != (before is None):
+            return False
+        if noise is not None and before is not None:
+            with np.errstate(invalid="ignore"):
+                same = (np.abs(noise - before) <= SAME * before) | (noise == before)
+            if not same.all():
+                return False
+        if self.detector.complete:
+            return self._used is None
+        return self._used is not None and np.array_equal(self._used, self.detector.used)
+
+    def _adapt(self, noise: Float) -> None:
+        """Adapt the detector if the frame's noise differs from that of the last frames."""
+        usable = noise[(noise > 0.0) & (noise < math.inf)]
+        if not usable.size:
+            return
+        now = float(np.median(usable))
+        if not 1.0 / NOISIER < now / self._stated < NOISIER:
+            self._stated = now
+            self.detector.set_noise(self._factor, np.full(self._layout.shape, now))
+            self._field = None
+
+
+def _gain_std(layout: PatchLayout, options: TrackerOptions) -> Float | None:
+    """Return the prior standard deviations (U + K + 1,) of the gains; None for a fresh baseline."""
+    if options.drift == "none":
+        return None
+    upper, lower = layout.shape
+    std = np.full(upper + lower + 1, 1e-4)
+    std[slice(0, upper) if options.drift == "wire" else slice(-1, None)] = options.drift_std
+    return std

@@ -1,0 +1,304 @@
+"""Slow state of an untouched patch: gains of its wires, offsets of its readings, and its own drift.
+
+The state is estimated from blocks of untouched frames. A block waits until the next one is complete before it
+is used, so that the frames just before a touch is noticed do not enter the estimate. Each reading also has an
+offset, which follows errors of R₀, rounding and creep over minutes.
+
+The prior of the drift is a random walk of :data:`skinnode.solve.detect.gain_drift.DRIFT` in an hour. The
+stream then shows its own drift: the means of its wires over two blocks some seconds apart. The less a stream
+drifts, the more slowly its gains follow, and the slower a press may be and still be found.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float
+from skinnode.solve.detect.gain_drift import DRIFT, MEASURED_S, PATCH_DRIFT
+from skinnode.solve.detect.touch_test import PatchNoise, TouchTest, filter_of, touch_test
+
+BLOCK_S: Final = 0.25
+"""Minimum duration of a block, s."""
+BLOCK: Final = 4
+"""Minimum number of frames in a block."""
+HELD_BACK: Final = 2.0
+"""Age of the newest frame in the estimate at most, in blocks, while the patch is untouched."""
+COARSER: Final = 4.0
+"""Ratio of the ages for which tests are made."""
+MOST_LEVEL: Final = 12
+"""Number of the greatest age for which a test is made; months."""
+FINER: Final = math.sqrt(2.0)
+"""Ratio of the drifts for which tests are made."""
+PRIOR: Final = 8.0
+"""Number of independent measurements of the drift after which the stated drift no longer counts."""
+WITHIN_S: Final = 120.0
+"""Time over which the drift of a stream is averaged, s."""
+MOST_DRIFT: Final = 2.0
+"""Largest drift, relative to the stated one."""
+OFFSET_S: Final = 600.0
+"""Time over which the offsets of the readings are averaged, s."""
+OFFSET_FRAMES: Final = 100
+"""Weight of the offset zero, in frames."""
+CREEP: Final = 6.0
+"""Offsets are averaged over the time since the release divided by this number, if that is less than
+:data:`OFFSET_S`: rubber creeps back ever more slowly."""
+START_S: Final = 60.0
+"""Time since the measurement of the baseline that the first frames assume, s."""
+CONVERGED: Final = 1.1
+"""Ratio to the steady state of the readings' variance, below which the gains have settled."""
+
+
+class SlowState:
+    """Slow state of one stream.
+
+    Args:
+        patch: Patch and noise.
+        start: Prior variances (U + K + 1,) of the gains at the start, as squares of relative errors; the
+            drift over :data:`START_S` if None.
+
+    Attributes:
+        expected: (U, K) changes of the readings of an untouched patch, in units of their noise.
+        age: Number of frames since the newest frame in the estimate.
+        offset_share: Variance of the offsets' errors, relative to the noise variance.
+    """
+
+    def __init__(self, patch: PatchNoise, start: Float | None = None) -> None:
+        self._patch, self._start = patch, start
+        upper, lower = patch.layout.shape
+        self.expected = np.zeros((upper, lower))
+        self._block_s = patch.block * patch.period_s
+        self._base = int(HELD_BACK * patch.block)
+        self._blocks_apart = max(1, round(MEASURED_S / self._block_s))
+        self._sum, self._seen = np.zeros((upper, lower)), np.zeros((upper, lower))
+        unit = float(np.median(patch.noise))
+        self._unit = unit
+        self._floor = unit * math.sqrt(3600.0) / 64.0  # less drift does not matter
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        upper, lower = self._patch.layout.shape
+        self._gains, self._offset = np.zeros(upper + lower + 1), np.zeros((upper, lower))
+        self.expected[:] = 0.0
+        self._filled, self._waiting = 0, False
+        self._waiting_mean = np.zeros((upper, lower))
+        self._measured, self._weight = 0.0, 0.0  # of the drift: sum of q, number of blocks
+        self._patch_measured = 0.0
+        self._means: list[tuple[Float, Float]] = []
+        self._frames = 0  # in the offsets
+        self._released: int | None = None  # number of frames since the last release
+        self._set_drift(DRIFT, PATCH_DRIFT)
+        self.age = 0
+        start = self._filter.growth(START_S) if self._start is None else self._start / self._unit**2
+        self._covariance: Float | None = self._filter.steady + np.diag(start)
+        self._level = self._level_for(self._covariance)
+        self.offset_share = 0.0
+
+    def _set_drift(self, drift: float, patch_drift: float) -> None:
+        self._drift, self._patch_drift = drift, patch_drift
+        self._filter = filter_of(self._patch, drift, patch_drift)
+        effect = self._filter.effect
+        self._visible = effect.T @ effect
+        self._steady_variance = float(np.einsum("ij,ji->", self._filter.steady, self._visible))
+        self._steady_gain = self._filter.correction(
+            self._filter.steady + np.diag(self._filter.walk * self._block_s)
+        )[0]
+
+    def _level_for(self, covariance: Float) -> int:
+        """Return the number of the least age whose test covers the given covariance of the gains."""
+        variance = float(np.einsum("ij,ji->", covariance, self._visible)) - self._steady_variance
+        level, seconds, diagonal = 0, self._base * self._patch.period_s, self._visible.diagonal()
+        while level < MOST_LEVEL and (self._filter.growth(seconds) * diagonal).sum() < 0.999 * variance:
+            level, seconds = level + 1, COARSER * seconds
+        return level
+
+    @property
+    def test(self) -> TouchTest:
+        """Test that accounts for the present error of the gains."""
+        return self.test_at(self._level)
+
+    def test_at(self, level: int) -> TouchTest:
+        """Return the test for a level: gains as old as :data:`HELD_BACK` blocks times a power of four."""
+        seconds = self._base * self._patch.period_s * COARSER**level
+        return touch_test(self._patch, self._drift, self._patch_drift, seconds)
+
+    @property
+    def level(self) -> int:
+        """Number of the present test."""
+        return self._level
+
+    @property
+    def drift(self) -> float:
+        """Standard deviation of the change of a wire's gain in an hour, as assumed at present."""
+        return self._drift
+
+    @property
+    def gains(self) -> Float:
+        """(U + K + 1,) relative changes of conductance, of the upper and lower wires and of the patch."""
+        return self._gains * self._unit
+
+    def collect(self, y: Float, present: NDArray[np.bool_] | None, noise: float) -> bool:
+        """Add an untouched frame; return whether :attr:`expected` or :attr:`test` changed.
+
+        Args:
+            y: (U, K) changes of the readings, in units of their noise, beyond those expected.
+            present: (U, K) mask of the readings; None if all are present.
+            noise: Noise variance of the stream, relative to the stated variance.
+        """
+        self._pass_frame()
+        self._sum += y
+        self._sum += self.expected if present is None else np.where(present, self.expected, 0.0)
+        self._seen += 1.0 if present is None else present
+        self._filled += 1
+        if self._filled < self._patch.block:
+            return self._grow()
+        mean = np.divide(self._sum, self._seen, out=self.expected.copy(), where=self._seen > 0.0)
+        self._sum[:], self._seen[:], self._filled = 0.0, 0.0, 0
+        if self._waiting:
+            self._use(self._waiting_mean, noise)
+        self._waiting_mean, self._waiting = mean, True
+        return True
+
+    def skip(self) -> bool:
+        """Pass a frame without using it; return whether :attr:`test` changed."""
+        self._pass_frame()
+        return self._grow()
+
+    def _pass_frame(self) -> None:
+        self.age += 1
+        if self._released is not None:
+            self._released += 1
+
+    def _grow(self) -> bool:
+        """Account for the age of the gains; return whether the level changed."""
+        if self.age <= self._base and self._covariance is None:
+            return False
+        covariance = self._filter.steady if self._covariance is None else self._covariance
+        before = self._level
+        walked = np.diag(self._filter.growth(self.age * self._patch.period_s))
+        self._level = max(
+            self._level_for(covariance + walked), self._level if self._covariance is None else 0
+        )
+        return self._level != before
+
+    def discard(self) -> None:
+        """Discard the frames that wait to be used, because a touch was found."""
+        self._sum[:], self._seen[:], self._filled, self._waiting = 0.0, 0.0, 0, False
+        self._means.clear()
+
+    def released(self, residue: Float | None = None) -> None:
+        """Note the end of a touch.
+
+        Args:
+            residue: (U, K) changes beyond those expected that remain after the touch, which become offsets;
+                None if there are none.
+        """
+        self._released = 0
+        if residue is not None:
+            self._offset += residue
+            self.expected += residue
+            self._covariance, self.age, self._level = None, 0, 0
+
+    def carry_on(self, gains: Float, expected: Float) -> None:
+        """Continue with the gains and the expectation of the same stream at another noise.
+
+        Args:
+            gains: (U + K + 1,) relative changes of conductance; see :attr:`gains`.
+            expected: (U, K) expected changes, in units of the noise.
+        """
+        self._gains = gains / self._unit
+        by_gains = (self._filter.effect @ self._gains).reshape(expected.shape)
+        self._offset = expected - by_gains
+        self.expected[:] = expected
+
+    def _use(self, mean: Float, noise: float) -> None:
+        """Estimate the gains and offsets from the mean of a block."""
+        period_s = self._patch.period_s
+        self._measure_drift(mean, noise)
+        beyond = mean - self.expected
+        since = self.age - 2 * self._patch.block  # from the last block used to this one
+        if self._covariance is None and since * period_s <= 2.5 * self._block_s:
+            gain = self._steady_gain
+        else:
+            covariance = self._filter.steady if self._covariance is None else self._covariance
+            gain, after = self._filter.correction(
+                covariance + np.diag(self._filter.growth(max(since, 1) * period_s))
+            )
+            variance = float(np.einsum("ij,ji->", after, self._visible))
+            self._covariance = None if variance <= CONVERGED * self._steady_variance else after
+        self._gains += gain @ beyond.ravel()
+        by_gains = (self._filter.effect @ self._gains).reshape(mean.shape)
+        share = self._offset_weight()
+        self._offset += share * (mean - by_gains - self._offset)
+        self.offset_share = 0.5 * share / self._patch.block
+        np.add(by_gains, self._offset, out=self.expected)
+        self.age = 2 * self._patch.block - self._patch.block
+        self._level = 0 if self._covariance is None else self._level_for(self._covariance)
+
+    def _offset_weight(self) -> float:
+        """Return the weight of a block in the offsets."""
+        block = self._patch.block
+        self._frames += block
+        longest = OFFSET_S / self._patch.period_s
+        frames = min(self._frames + OFFSET_FRAMES, longest)
+        if self._released is not None:
+            since = self._released / CREEP
+            if since >= longest:
+                self._released = None
+            else:
+                frames = min(frames, since)
+        return min(block / max(frames, 1.0), 0.3)
+
+    def _measure_drift(self, mean: Float, noise: float) -> None:
+        """Measure the drift of the stream between this block and an earlier one."""
+        upper, lower = mean.shape
+        means = self._means
+        means.append((mean.mean(axis=1), mean.mean(axis=0)))
+        if len(means) <= self._blocks_apart:
+            return
+        rows, columns = means.pop(0)
+        by_rows, by_columns = means[-1][0] - rows, means[-1][1] - columns
+        seconds = self._blocks_apart * self._block_s
+        of_noise = 2.0 * noise / self._patch.block
+        common = float(by_rows.mean())
+        sums = 0.0
+        for moved, count, other in ((by_rows, upper, lower), (by_columns, lower, upper)):
+            if count > 1:
+                variance = float(((moved - moved.mean()) ** 2).sum()) / (count - 1) - of_noise / other
+                sums += variance * other / (upper + lower)
+        found = sums / seconds
+        most = max(1.0, WITHIN_S / self._block_s)
+        self._weight = min(self._weight + 1.0, most)
+        self._measured += (found - self._measured) / self._weight
+        patch = (common**2 - of_noise / (upper * lower)) / seconds - max(found, 0.0) * (1 / upper + 1 / lower)
+        self._patch_measured += (patch - self._patch_measured) / self._weight
+        std = of_noise / lower * math.sqrt(2.0 / max(upper - 1, 1)) / seconds
+        patch_std = of_noise / (upper * lower) * math.sqrt(2.0) / seconds
+        drift = self._chosen(self._drift, DRIFT, self._measured, std)
+        patch_drift = self._chosen(self._patch_drift, PATCH_DRIFT, self._patch_measured, patch_std)
+        if (drift, patch_drift) != (self._drift, self._patch_drift):
+            self._set_drift(drift, patch_drift)
+
+    def _chosen(self, used: float, stated: float, measured: float, std: float) -> float:
+        """Return the drift (standard deviation in an hour) to assume.
+
+        Args:
+            used: Drift assumed so far.
+            stated: Drift of the prior.
+            measured: Mean measured drift, as a growth of variance in a second in units of the noise.
+            std: Standard deviation of a single measurement.
+        """
+        independent = self._weight / self._blocks_apart
+        prior = max(0.0, 1.0 - independent / PRIOR) * self._blocks_apart
+        found = (prior * (stated / self._unit) ** 2 / 3600.0 + self._weight * measured) / (
+            prior + self._weight
+        )
+        found += 2.0 * std / math.sqrt(max(independent, 1.0))
+        drift = max(self._unit * math.sqrt(3600.0 * max(found, 0.0)), self._floor)
+        steps = max(math.floor(math.log(MOST_DRIFT * stated / drift) / math.log(FINER) + 1e-9), 0)
+        level = MOST_DRIFT * stated / FINER**steps
+        return used if level < used <= 1.1 * FINER * drift else level

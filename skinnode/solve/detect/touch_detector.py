@@ -1,0 +1,334 @@
+"""Touch detector of one patch: decides before anything is solved whether the skin is touched.
+
+A touch begins when the statistic of a frame, or of the mean of three frames, exceeds its threshold
+(:mod:`skinnode.solve.detect.touch_test`). :mod:`skinnode.solve.detect.held_touch` decides when it has ended.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.detect.held_touch import HeldTouch, creep_of
+from skinnode.solve.detect.slow_state import BLOCK, BLOCK_S, OFFSET_S, SlowState
+from skinnode.solve.detect.touch_kernel import (
+    COUNT,
+    KEPT,
+    LOWER,
+    MOTION,
+    RATIO,
+    UPPER,
+    WORST,
+    TouchArrays,
+    retest,
+    see_frame,
+)
+from skinnode.solve.detect.touch_test import (
+    MOST_VECTORS,
+    PatchNoise,
+    TouchTest,
+    bounded_exp,
+    log_likelihood_ratio,
+)
+
+ENOUGH: Final = 0.5
+"""Minimum share of usable readings; with fewer, the detector does not decide."""
+ODD_READING: Final = 6.0
+"""Change of a single reading, in standard deviations, above which a frame is solved and its data checked.
+Noise exceeds it in one of 1,700,000 frames of 300 readings."""
+ODD_WIRE: Final = 8.0
+"""Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data checked.
+Noise exceeds it in one of 25,000 frames or fewer."""
+TOUCHES_PER_S: Final = 1.0 / 60.0
+"""Prior rate of touches, 1/s, for the odds."""
+TOUCH_S: Final = 1.0
+"""Prior mean duration of a touch, s, for the odds."""
+PREPARED: Final = 6
+"""Number of tests made in advance, for touches of up to ten minutes."""
+NOISE_FRAMES: Final = 400
+"""Number of frames over which the noise is averaged."""
+NOISE_START: Final = 30
+"""Weight of the stated noise, in frames."""
+QUIETER: Final = 0.6
+"""Ratio of a touched frame's noise variance to the average, below which the average must be too large."""
+NOISE_STEP: Final = 1.25
+"""Largest ratio of a frame's noise variance to the average that enters the average."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchVerdict:
+    """Decision about a frame."""
+
+    touched: bool | None
+    """Whether the patch is touched; None if too few readings are usable."""
+    odds: float
+    """Odds of touch to no touch; see :attr:`skinnode.FieldFrame.touch_odds`."""
+    quiet: bool
+    """Whether the frame need not be solved: the patch is untouched and no reading is unusual."""
+
+
+class TouchDetector:
+    """Touch detector of one patch. Each stream needs its own instance. The constructor compiles the kernels.
+
+    Args:
+        layout: The patch.
+        baseline_ohm: (U, K) resistances at rest, ohm; readings without a positive one are ignored.
+        noise: (U, K) relative standard deviation of the readings, without quantization.
+        rounding: (U, K) relative standard deviation of the quantization error.
+        period_s: Scan period, s.
+        false_alarms_per_hour: Accepted number of false alarms in an hour.
+        gain_std: (U + K + 1,) standard deviation of the gains at the start; None for a fresh baseline.
+
+    Attributes:
+        touched: Whether the patch is touched, as of the last frame with enough readings.
+    """
+
+    def __init__(  # noqa: PLR0913 - the facts about a stream
+        self,
+        layout: PatchLayout,
+        baseline_ohm: Float,
+        noise: Float,
+        rounding: Float,
+        *,
+        period_s: float,
+        false_alarms_per_hour: float,
+        gain_std: Float | None = None,
+    ) -> None:
+        upper, lower = layout.shape
+        self._layout, self._own, self._rounding = layout, noise.copy(), rounding.copy()
+        self._period_s, self._rate = period_s, false_alarms_per_hour
+        self._gain_variance = None if gain_std is None else gain_std**2
+        self._known = np.isfinite(baseline_ohm) & (baseline_ohm > 0.0)
+        self._arrays = TouchArrays(
+            ohm=np.full((upper, lower), np.nan),
+            rest=np.where(self._known, baseline_ohm, 1.0),
+            weight=np.zeros((upper, lower)),
+            expected=np.zeros((upper, lower)),
+            recent=np.zeros((KEPT, upper * lower)),
+            products=np.zeros((KEPT, MOST_VECTORS)),
+            residual=np.zeros(upper),
+            columns=np.zeros(lower),
+            counts=np.zeros(lower),
+            found=np.zeros(9),
+        )
+        self._factor = 1.0
+        self._prepare()
+        self._arrays.ohm[:] = self._arrays.rest
+        self._at, self._frames = 0, 1
+        self._compute(1.0)
+        retest(self._arrays.table, self._test.rows, 0, 1)  # compile the kernels
+        self.reset()
+
+    def _prepare(self) -> None:
+        """Make the slow state and the test for the present noise."""
+        sigma = np.hypot(self._factor * self._own, self._rounding)
+        # noise of half a code or more makes the quantization errors of successive frames independent
+        coded = self._rounding**2 / sigma**2
+        undithered = (self._factor * self._own) ** 2 < 3.0 * self._rounding**2
+        # rounded, so that patches whose noise differs only by rounding errors share their tests
+        self._sigma = np.ascontiguousarray(sigma.astype(np.float32), np.float64)
+        self._weight = np.where(self._known, 1.0 / sigma, 0.0)
+        self._least_noise = min(1.0, max(float(np.median(coded)), 1e-4))
+        block = max(BLOCK, round(BLOCK_S / self._period_s))
+        patch = PatchNoise(
+            self._layout,
+            self._sigma.tobytes(),
+            round(float(np.where(undithered, coded, 0.0).mean()), 3),
+            self._period_s,
+            self._rate,
+            block,
+        )
+        self._slow = SlowState(patch, self._gain_variance)
+        self._use_test()
+
+    def prepare(self) -> None:
+        """Make the tests that a stream needs in its first minutes; each takes about 15 ms."""
+        for level in range(PREPARED):
+            self._slow.test_at(level)
+
+    def _use_test(self) -> None:
+        self._test: TouchTest = self._slow.test
+
+    def reset(self) -> None:
+        """Forget the stream; the patch counts as untouched and the baseline as fresh."""
+        self.touched = False
+        self._noise, self._noise_frames = 1.0, NOISE_START
+        self._at, self._frames = 0, 0
+        self._log_odds = -math.inf
+        self._clock = 0  # frames
+        self._crept_peak, self._crept_at = 0.0, 0  # of the last touch that was not itself creep
+        self._slow.reset()
+        self._use_test()
+        self._arrays.expected[:] = 0.0
+
+    def set_noise(self, factor: float, noise: Float | None = None) -> None:
+        """Change the noise; the state of the stream is kept.
+
+        Args:
+            factor: Factor by which the stated noise without quantization is multiplied.
+            noise: (U, K) stated noise; as before if None.
+        """
+        if factor == self._factor and noise is None:
+            return
+        gains, expected, before = self._slow.gains, self._arrays.expected.copy(), self._sigma
+        self._factor = factor
+        if noise is not None:
+            self._own = noise.copy()
+        self._prepare()
+        self._slow.carry_on(gains, expected * before / self._sigma)
+        self._arrays.expected[:] = self._slow.expected
+        self._noise, self._noise_frames, self._frames = 1.0, NOISE_START, 0
+        if self.touched:
+            self._begin_touch()
+
+    @property
+    def test(self) -> TouchTest:
+        """Test in use."""
+        return self._test
+
+    @property
+    def gains(self) -> Float:
+        """(U + K + 1,) relative errors of the readings of the upper and lower wires and of the patch."""
+        return -self._slow.gains
+
+    @property
+    def residual(self) -> Float:
+        """(U,) RMS relative change since rest of the readings of each upper wire in the last frame."""
+        return self._arrays.residual.copy()
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(U, K) mask of the readings used in the last frame."""
+        its = self._arrays
+        with np.errstate(invalid="ignore"):
+            return np.asarray((its.ohm > 0.0) & (its.ohm < math.inf) & (its.weight > 0.0))
+
+    @property
+    def complete(self) -> bool:
+        """Whether all readings of the last frame were used."""
+        return float(self._arrays.found[COUNT]) == self._arrays.ohm.size
+
+    def see(
+        self,
+        ohm: Float,
+        valid: NDArray[np.bool_] | None = None,
+        noise: Float | None = None,
+    ) -> TouchVerdict:
+        """Decide about the next frame.
+
+        Args:
+            ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
+            valid: (U, K) bool, False for readings to be ignored; None if there are none.
+            noise: (U, K) relative noise of this frame with quantization, if it may be larger than usual.
+        """
+        its = self._arrays
+        its.ohm[:] = ohm
+        weight = self._weight
+        if noise is not None:
+            usable = self._known & (noise > 0.0) & (noise < math.inf)
+            weight = np.where(usable, 1.0 / np.maximum(noise, self._sigma), 0.0)
+        if valid is not None:
+            weight = np.where(valid, weight, 0.0)
+        its.weight[:] = weight
+        self._at = (self._at + 1) % KEPT
+        self._frames = min(self._frames + 1, KEPT)
+        self._clock += 1
+        self._compute(self._noise * (1.0 + self._slow.offset_share))
+        found = its.found.tolist()
+        if found[COUNT] < ENOUGH * its.ohm.size:
+            self._frames = 0
+            self._slow.skip()
+            return TouchVerdict(None, bounded_exp(self._log_odds), False)
+        self._follow_noise(found)
+        variance = self._noise * (1.0 + self._slow.offset_share)
+        scaled = [each / variance for each in found[:3]]
+        if self.touched:
+            self._follow_touch(variance)
+            quiet = False
+        else:
+            quiet = self._follow_rest(scaled, found)
+        return TouchVerdict(self.touched, bounded_exp(self._log_odds), quiet)
+
+    def _compute(self, variance: float) -> None:
+        test = self._test
+        see_frame(self._arrays.table, test.rows, test.shares, test.log_dets, variance, self._at, self._frames)
+
+    def _follow_noise(self, found: list[float]) -> None:
+        """Average the noise variance. In touched frames, motion adds to it."""
+        now = found[MOTION]
+        unsure = self._noise_frames < 2 * NOISE_START or now < QUIETER * self._noise
+        if now < 0.0 or (self.touched and not unsure):
+            return
+        limited = min(max(now, self._noise / NOISE_STEP), self._noise * NOISE_STEP)
+        self._noise_frames = min(self._noise_frames + 1, NOISE_FRAMES)
+        self._noise = max(self._noise + (limited - self._noise) / self._noise_frames, self._least_noise)
+
+    def _follow_rest(self, scaled: list[float], found: list[float]) -> bool:
+        """Process a frame of an untouched patch; return whether it need not be solved."""
+        test, its = self._test, self._arrays
+        self._update_odds(found[RATIO])
+        if scaled[0] > test.onset[0] or scaled[1] > test.onset[1]:
+            self._begin_touch()
+            return False
+        doubt = scaled[0] > test.doubt[0] or scaled[1] > test.doubt[1]
+        if doubt:
+            changed = self._slow.skip()
+        else:
+            y = its.recent[self._at].reshape(its.ohm.shape)
+            changed = self._slow.collect(y, None if self.complete else self.used, self._noise)
+        if changed:
+            self._change_test()
+        odd = found[WORST] > ODD_READING or max(found[UPPER], found[LOWER]) > ODD_WIRE
+        return not (doubt or odd)
+
+    def _change_test(self) -> None:
+        """Use the slow state's present expectation and test."""
+        its, slow = self._arrays, self._slow
+        its.recent += (its.expected - slow.expected).ravel()
+        its.expected[:] = slow.expected
+        self._use_test()
+        retest(its.table, self._test.rows, self._at, self._frames)
+
+    def _update_odds(self, log_ratio: float) -> None:
+        """Update the odds with a frame's log likelihood ratio, by Bayes' rule in a chain of two states."""
+        begins = min(TOUCHES_PER_S * self._period_s, 0.5)
+        ends = min(self._period_s / TOUCH_S, 0.5)
+        odds = bounded_exp(self._log_odds)
+        prior = (1.0 - ends) / ends
+        if odds < math.inf:
+            prior = (odds * (1.0 - ends) + begins) / (odds * ends + 1.0 - begins)
+        self._log_odds = log_ratio + math.log(prior)
+
+    def _begin_touch(self) -> None:
+        self.touched = True
+        self._slow.discard()
+        since_s = (self._clock - self._crept_at) * self._period_s
+        creep = creep_of(self._crept_peak, since_s) if since_s < OFFSET_S else 0.0
+        self._touch = HeldTouch(self._test, self._arrays.recent[self._at].copy(), self._period_s, creep)
+
+    def _follow_touch(self, variance: float) -> None:
+        """Process a frame of a touched patch."""
+        its, slow = self._arrays, self._slow
+        slow.skip()
+        later, ratio = slow.test, float(its.found[RATIO])
+        if later is not self._test:
+            ratio = log_likelihood_ratio(later, later.rows @ its.recent[self._at] / math.sqrt(variance))
+        self._update_odds(ratio)
+        if self._frames < KEPT:
+            return
+        touch = self._touch
+        ended = touch.follow(its.recent, its.recent[(self._at + 1) % KEPT], variance, later)
+        if ended is False:
+            return
+        self.touched = False
+        slow.released(touch.average.reshape(its.ohm.shape) if ended is None else None)
+        if ended or not touch.is_creep:
+            self._crept_peak, self._crept_at = touch.peak, self._clock
+        if ended is None:
+            self._log_odds = -math.inf
+        self._change_test()

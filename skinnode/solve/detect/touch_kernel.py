@@ -1,0 +1,169 @@
+"""Compiled part of the touch detector: one pass over the readings of a frame."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.array_table import ArrayTable, reader
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.cholesky import multiply_vector
+
+KEPT: Final = 4
+"""Number of frames kept for the means."""
+STATISTICS: Final = (1, 3, 4)
+"""Numbers of frames of the means whose statistic is computed."""
+WORST, UPPER, LOWER, COUNT, MOTION, RATIO = 3, 4, 5, 6, 7, 8
+"""Positions of the other results in ``found``."""
+
+
+class TouchArrays(ArrayTable):
+    """Arrays of the detector of one patch. Changes y are in units of the noise of their reading."""
+
+    ohm: Annotated[NDArray[np.float64], "U K"]
+    """Resistances of the frame, ohm; NaN where missing."""
+    rest: Annotated[NDArray[np.float64], "U K"]
+    """Resistances at rest, ohm."""
+    weight: Annotated[NDArray[np.float64], "U K"]
+    """1 / σ of each reading, or less if the frame is noisier than usual; 0 where it is to be ignored."""
+    expected: Annotated[NDArray[np.float64], "U K"]
+    """Changes y of an untouched patch, from the gains and the offsets of its readings."""
+    recent: Annotated[NDArray[np.float64], "4 m"]
+    """Unexpected changes of the last frames."""
+    products: Annotated[NDArray[np.float64], "4 R"]
+    """z = G y of the last frames; only the first columns are used if the test has fewer rows."""
+    residual: Annotated[NDArray[np.float64], "U"]
+    """RMS of ln(R₀/R) of each upper wire's readings; inf without any."""
+    columns: Annotated[NDArray[np.float64], "K"]
+    """Work array."""
+    counts: Annotated[NDArray[np.float64], "K"]
+    """Work array."""
+    found: Annotated[NDArray[np.float64], "9"]
+    """Results: w ‖mean z‖² for w of 1, 3 and 4 frames; largest |y| of a reading and largest excess of χ² of
+    an upper and of a lower wire, each in standard deviations; number of readings used; noise variance from
+    three successive frames, in units of the stated variance, or −1; log likelihood ratio of touch to no
+    touch."""
+
+
+arrays_of = reader(TouchArrays)
+
+
+@njit_part
+def _norms(products: Float, size: int, at: int, frames: int, found: Float) -> None:
+    """Write w ‖mean z‖² of the last w frames into ``found``, or 0 if there are fewer frames."""
+    found[0], found[1], found[2] = 0.0, 0.0, 0.0
+    now, last = products[at], products[(at + 3) % 4]
+    third, fourth = products[(at + 2) % 4], products[(at + 1) % 4]
+    one, three, four = 0.0, 0.0, 0.0
+    for i in range(size):
+        three_sum = now[i] + last[i] + third[i]
+        four_sum = three_sum + fourth[i]
+        one += now[i] * now[i]
+        three += three_sum * three_sum
+        four += four_sum * four_sum
+    found[0] = one
+    if frames >= 3:
+        found[1] = three / 3.0
+    if frames >= 4:
+        found[2] = four / 4.0
+
+
+@njit_part
+def _log_ratio(z: Float, size: int, shares: Float, log_dets: Float, variance: float) -> float:
+    """Return ln Σ exp ½ (Σ share z² / variance − log_det) over the octaves of depth."""
+    most, total = -np.inf, 0.0
+    for j in range(log_dets.size):
+        row, square = shares[j], 0.0
+        for i in range(size):
+            square += row[i] * z[i] * z[i]
+        term = 0.5 * (square / variance - log_dets[j])
+        if term > most:
+            total = total * np.exp(most - term) + 1.0
+            most = term
+        else:
+            total += np.exp(term - most)
+    found: float = most + np.log(total)
+    return found
+
+
+@njit
+def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
+    table: NDArray[np.int64],
+    rows: Float,
+    shares: Float,
+    log_dets: Float,
+    variance: float,
+    at: int,
+    frames: int,
+) -> None:
+    """Compute the statistics of a frame.
+
+    Args:
+        table: Table of :class:`TouchArrays`.
+        rows: (r, m) G of the test.
+        shares: (S, r) weights of the test's likelihood ratios.
+        log_dets: (S,) constants of the test's likelihood ratios.
+        variance: Noise variance of the stream, relative to the stated variance.
+        at: Position of this frame in ``recent`` and ``products``.
+        frames: Number of frames in ``recent``, including this one.
+    """
+    its = arrays_of(table)
+    ohm, rest, weight, expected = its.ohm, its.rest, its.weight, its.expected
+    columns, counts, found, recent = its.columns, its.counts, its.found, its.recent
+    y, last, before = recent[at], recent[(at + 3) % 4], recent[(at + 2) % 4]
+    upper, lower = ohm.shape
+    used, worst, excess, motion, pairs = 0, 0.0, 0.0, 0.0, 0
+    for k in range(lower):
+        columns[k] = counts[k] = 0.0
+    for u in range(upper):
+        total, moved, here = 0.0, 0.0, 0
+        for k in range(lower):
+            i = u * lower + k
+            r, r0, w = ohm[u, k], rest[u, k], weight[u, k]
+            y[i] = 0.0
+            if r > 0.0 and r < 1e300 and w > 0.0:
+                s = (r0 - r) / (r0 + r)  # ln(R₀/R) = 2 artanh s
+                s2 = s * s
+                change = 2.0 * s * (1.0 + s2 * (1.0 / 3.0 + s2 * (0.2 + s2 / 7.0)))
+                moved += change * change
+                value = change * w - expected[u, k]
+                y[i] = value
+                square = value * value
+                total += square
+                columns[k] += square
+                counts[k] += 1.0
+                here += 1
+                worst = max(worst, square)
+                if frames >= 3 and last[i] != 0.0 and before[i] != 0.0:
+                    bend = value - 2.0 * last[i] + before[i]
+                    motion += bend * bend
+                    pairs += 1
+        used += here
+        its.residual[u] = np.sqrt(moved / here) if here else np.inf
+        if here:
+            excess = max(excess, (total / variance - here) / np.sqrt(2.0 * here))
+    found[WORST], found[UPPER], found[COUNT] = np.sqrt(worst / variance), excess, float(used)
+    excess = 0.0
+    for k in range(lower):
+        if counts[k] > 0.0:
+            excess = max(excess, (columns[k] / variance - counts[k]) / np.sqrt(2.0 * counts[k]))
+    found[LOWER] = excess
+    found[MOTION] = motion / (6.0 * pairs) if pairs else -1.0
+    size = rows.shape[0]
+    multiply_vector(rows, y, its.products[at, :size])
+    _norms(its.products, size, at, frames, found)
+    found[RATIO] = _log_ratio(its.products[at], size, shares, log_dets, variance)
+
+
+@njit
+def retest(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> None:
+    """Compute the statistics of the last frames again with another test; see :func:`see_frame`."""
+    its = arrays_of(table)
+    size = rows.shape[0]
+    for back in range(frames):
+        one = (at - back) % 4
+        multiply_vector(rows, its.recent[one], its.products[one, :size])
+    _norms(its.products, size, at, frames, its.found)

@@ -1,0 +1,97 @@
+"""Tail of a weighted sum of χ² variables, the distribution of the touch statistic without a touch.
+
+The tail of T = Σ w_i z_i² for independent standard normal z_i follows from the cumulant generating function
+K(t) = −½ Σ ln(1 − 2 t w_i) by the saddle-point approximation of Lugannani and Rice (Advances in Applied
+Probability 12, 1980, 475-490). For the weights of the touch test, its relative error is below 2 % down to
+probabilities of 1e-7 (``tests/solve/test_weighted_chi_squared.py``).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+
+_STEPS: Final = 200
+"""Maximum number of steps of each iteration; they take 5 to 60."""
+_TOLERANCE: Final = 1e-6
+"""Relative error of the probability at which the search for a quantile ends."""
+
+
+def tail_probability(weights: Float, value: float) -> float:
+    """Return the probability that Σ w_i z_i² exceeds ``value``.
+
+    Args:
+        weights: (r,) weights w_i, positive.
+        value: Value of the sum, positive.
+    """
+    mean = float(weights.sum())
+    if not value > 0.0:
+        return 1.0
+    t = _saddle_point(weights, value)
+    left = 1.0 - 2.0 * t * weights
+    cumulant = -0.5 * float(np.log(left).sum())
+    curvature = 2.0 * float(((weights / left) ** 2).sum())
+    if abs(t) * mean < 1e-4:  # near the mean, where the formula is 0/0
+        skewness = 8.0 * float((weights**3).sum()) / (2.0 * float((weights**2).sum())) ** 1.5
+        return float(0.5 - skewness / (6.0 * math.sqrt(2.0 * math.pi)))
+    w = math.copysign(math.sqrt(max(2.0 * (t * value - cumulant), 0.0)), t)
+    u = t * math.sqrt(curvature)
+    density = math.exp(-0.5 * w * w) / math.sqrt(2.0 * math.pi)
+    return min(max(0.5 * math.erfc(w / math.sqrt(2.0)) + density * (1.0 / u - 1.0 / w), 0.0), 1.0)
+
+
+def upper_quantile(weights: Float, probability: float) -> float:
+    """Return the value that Σ w_i z_i² exceeds with the given probability.
+
+    Args:
+        weights: (r,) weights w_i, positive.
+        probability: Tail probability, greater than 0 and less than 1.
+
+    Raises:
+        ValueError: If the probability is out of range, or no weight is positive.
+    """
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"probability: got {probability}, must be greater than 0 and less than 1")
+    if not (weights.size and float(weights.max()) > 0.0):
+        raise ValueError("weights: got no positive weight, must have at least one")
+    wanted, low, high = math.log(probability), 0.0, float(weights.sum())
+    tail = tail_probability(weights, high)
+    while tail > probability:
+        low, high = high, 2.0 * high
+        tail = tail_probability(weights, high)
+    below, above = math.log(tail_probability(weights, low)) - wanted, math.log(max(tail, 1e-300)) - wanted
+    for _ in range(_STEPS):  # regula falsi with the Illinois rule; ln p is nearly linear in the tail
+        middle = high - above * (high - low) / (above - below)
+        found = math.log(max(tail_probability(weights, middle), 1e-300)) - wanted
+        if abs(found) < _TOLERANCE or high - low < 1e-12 * high:
+            return middle
+        if found > 0.0:
+            low, below, above = middle, found, 0.5 * above
+        else:
+            high, above, below = middle, found, 0.5 * below
+    return high
+
+
+def _saddle_point(weights: Float, value: float) -> float:
+    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, by Newton's method between two bounds."""
+    high = 0.5 / float(weights.max())
+    low = -0.5 * weights.size / value  # there, K' < value
+    t = 0.0
+    for _ in range(_STEPS):
+        terms = weights / (1.0 - 2.0 * t * weights)
+        error = float(terms.sum()) - value
+        if error > 0.0:
+            high = t
+        else:
+            low = t
+        if abs(error) < 1e-12 * value:
+            break
+        step = t - error / (2.0 * float((terms**2).sum()))
+        t = step if low < step < high else 0.5 * (low + high)
+        if not low < t < high:
+            break
+    return t

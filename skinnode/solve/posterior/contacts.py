@@ -24,7 +24,7 @@ from skinnode.solve.layer_force import bonded_force_n, layer_std_n
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.contact_regions import find_regions, region_scratch
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
-from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
+from skinnode.solve.posterior.load_prior import PRIOR_DOUBT
 
 HERTZ_SPREAD: Final = 2.5
 """Ratio of a² to the pressure-weighted mean of r² in a Hertz contact of radius a, where the pressure is

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from skinnode.model.layout import Float
-from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE
+from skinnode.solve.posterior.load_prior import PRIOR_DOUBT, SMOOTH_SHARE
 
 
 def data_share(std: Float, core: Float, prior_variance: Float) -> Float:

@@ -36,6 +36,7 @@ from skinnode.solve.posterior.data_share import data_share
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.gating import Fit, Gate
 from skinnode.solve.posterior.hyperparameters import Hyperparameters
+from skinnode.solve.posterior.local.disc_prior import DiscPrior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation, ObservationModel, Readings
 from skinnode.solve.wires.decode import A_MAX, A_MIN
@@ -114,7 +115,8 @@ class FrameEstimator:
         self._far = roots.FAR * float(self._problem.clearance.min())
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
-        self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
+        discs = DiscPrior(self._estimator, elastic.shape, height) if options.prior == "discs" else None
+        self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise, discs)
         self.noise_estimate: NoiseEstimate | None = None
         self._forget()
         self.from_rest_s = 0.0
@@ -444,7 +446,7 @@ class FrameEstimator:
         estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
-        std[:, self._free], core[:, self._free] = estimator.std, estimator.core
+        std[:, self._free], core[:, self._free] = self._hyper.with_spread(estimator.std, estimator.core)
         if held.all():  # allow for displacements too small for the gate to detect
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)

@@ -14,6 +14,7 @@ import numpy as np
 
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior.local.disc_prior import DiscPrior
 from skinnode.solve.posterior.load_posterior import LoadPosterior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
@@ -35,6 +36,16 @@ SCALE_LEAST: Final = 1.0
 noise. Displacements below the noise cannot be detected, so the standard deviations must allow for them."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the hyperparameters per frame."""
+DISC_FITS: Final = 2
+"""Maximum number of fits of the discs per frame."""
+REFIT: Final = 0.1
+"""Largest change in a coordinate since the last fit of the discs, relative to the largest displacement, above
+which the discs are fitted again."""
+UNTOUCHED: Final = 0.1
+"""Load variance expected on untouched skin, relative to the minimum prior variance of equal loads over the whole
+patch (:data:`SCALE_LEAST`)."""
+SPREAD: Final = 1.0
+"""Factor applied to the variance due to the choice of the discs."""
 REFINEMENTS: Final = 3
 """Maximum number of updates of the expected load locations per frame. Each update costs as much as two
 solves."""
@@ -55,17 +66,25 @@ class Hyperparameters:
         clearance: Median clearance, pitches.
         scale2: Fixed s², pitch²; None to estimate it.
         estimate_noise: Whether to estimate the noise.
+        discs: Discs of expected loads; None to expect loads in the cells where they were found.
 
     Attributes:
         noise_factor: Ratio of the estimated to the configured noise.
         loads: Posterior of the loads.
     """
 
-    def __init__(
-        self, estimator: MapEstimator, clearance: float, scale2: float | None, estimate_noise: bool
+    def __init__(  # noqa: PLR0913 - the patch and what to estimate
+        self,
+        estimator: MapEstimator,
+        clearance: float,
+        scale2: float | None,
+        estimate_noise: bool,
+        discs: DiscPrior | None = None,
     ) -> None:
         self._estimator, self._prior = estimator, estimator.load_prior
         self.loads = LoadPosterior(estimator)
+        self.discs = discs
+        self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
         self._fixed = scale2
         self._estimate_noise = estimate_noise
         self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
@@ -78,6 +97,18 @@ class Hyperparameters:
         self._estimator.reset(self._fixed or self._expected)
         self.noise_factor = 1.0
         self._least = self._expected
+        self._forget_discs()
+
+    def _forget_discs(self) -> None:
+        if self.discs is not None:
+            self.discs.reset()
+
+    def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
+        """Return standard deviations (U, f) that include the uncertainty of the discs, pitches."""
+        if self.discs is None:
+            return std, core
+        spread = SPREAD * self.discs.spread.reshape(std.shape)
+        return np.sqrt(std**2 + spread), np.sqrt(core**2 + spread)
 
     def set_least(self, observation: Observation) -> None:
         """Set the minimum prior scale from the noise of a frame."""
@@ -88,6 +119,7 @@ class Hyperparameters:
 
     def spread(self, observation: Observation, members: Index) -> None:
         """Expect equal loads over the whole patch, and estimate their scale from the frame."""
+        self._forget_discs()
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
@@ -95,6 +127,7 @@ class Hyperparameters:
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
         """Expect equal loads over the whole patch, at a scale estimated from the frame with the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
+        self._forget_discs()
         self._prior.spread(guess)
 
     def adapt(
@@ -113,13 +146,14 @@ class Hyperparameters:
         """
         estimator, prior = self._estimator, self._prior
         if not local and self._fixed is None and (prior.share != 1.0).any():
+            self._forget_discs()
             prior.spread(self._expected)
             estimator.track(observation, members)
         refinements = REFINEMENTS if local else 0
         for _ in range(ADAPTIONS):
             moved, g, scale2 = estimator.moved.copy(), estimator.g.copy(), prior.scale2
             share, before = prior.share.copy(), observation
-            changed = self._fixed is None and self._set_scale(local=local, refine=refinements > 0)
+            changed = self._fixed is None and self._set_prior(observation, members, local, refinements)
             refinements -= 1
             found = self.noise_factor
             if self._estimate_noise:
@@ -139,6 +173,30 @@ class Hyperparameters:
                 estimator.track(observation, members)
                 break
         return observation
+
+    def _set_prior(self, observation: Observation, members: Index, local: bool, refinements: int) -> bool:
+        """Estimate the prior from the evidence; return whether it changed."""
+        uniform = bool((self._prior.share == 1.0).all())
+        if local and self.discs is not None and (uniform or len(self.discs.discs)):
+            return self._fit_discs(observation, members, uniform) if refinements > REFINEMENTS - DISC_FITS else False
+        return self._set_scale(local=local, refine=refinements > 0)
+
+    def _fit_discs(self, observation: Observation, members: Index, uniform: bool) -> bool:
+        """Fit the discs to the frame, unless they fit already; return whether the prior changed."""
+        discs, prior, estimator = self.discs, self._prior, self._estimator
+        assert discs is not None
+        gone = float(np.abs(estimator.moved - self._fitted).max())
+        if not uniform and gone < REFIT * float(np.abs(estimator.moved).max()):
+            return False
+        self._fitted[:] = estimator.moved
+        untouched2 = UNTOUCHED * self._least
+        variance = discs.fit(observation, members, untouched2, prior.scale2 if uniform else self._expected)
+        if variance is None:
+            prior.spread(prior.scale2 if uniform else self._expected)
+            estimator.track(observation, members)
+            return self._set_scale(local=True, refine=True)
+        prior.set_discs(np.minimum(variance, self._most), untouched2)
+        return True
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
         """Estimate the scale and the load locations from the evidence; return whether the prior changed."""

@@ -33,7 +33,7 @@ from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
 from skinnode.solve.posterior.data_share import data_share
-from skinnode.solve.posterior.elastic_prior import ElasticPrior
+from skinnode.solve.posterior.elastic_prior import LAYER_SHARE, ElasticPrior, bonded_response
 from skinnode.solve.posterior.gating import Fit, Gate
 from skinnode.solve.posterior.hyperparameters import Hyperparameters
 from skinnode.solve.posterior.local.disc_prior import DiscPrior
@@ -115,7 +115,11 @@ class FrameEstimator:
         self._far = roots.FAR * float(self._problem.clearance.min())
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
-        discs = DiscPrior(self._estimator, elastic.shape, height) if options.prior == "discs" else None
+        discs = None
+        if options.prior == "discs":
+            every = (np.arange(wires)[:, None] * layout.unknowns + self._free).ravel()
+            layer = np.ascontiguousarray(bonded_response(layout)[every] / LAYER_SHARE)
+            discs = DiscPrior(self._estimator, elastic.shape, height, layer)
         self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise, discs)
         self.noise_estimate: NoiseEstimate | None = None
         self._forget()

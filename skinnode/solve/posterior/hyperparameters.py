@@ -195,7 +195,7 @@ class Hyperparameters:
             prior.spread(prior.scale2 if uniform else self._expected)
             estimator.track(observation, members)
             return self._set_scale(local=True, refine=True)
-        prior.set_discs(np.minimum(variance, self._most), untouched2)
+        prior.set_discs(np.minimum(variance, self._most), discs.layer, untouched2)
         return True
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:

@@ -112,21 +112,23 @@ class LoadPrior:
         self._made_anew(self.covariance)
         return True
 
-    def set_discs(self, variance: Float, untouched2: float) -> None:
+    def set_discs(self, variance: Float, layer: Float, untouched2: float) -> None:
         """Set the variances of the loads to those of a few loaded cells, and of an untouched skin elsewhere.
 
         Args:
-            variance: (Q,) load variance of each cell, pitch².
-            untouched2: Load variance of the cells without discs, pitch².
+            variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, pitch².
+            layer: (U f, Q) displacement per unit load on a bonded layer, pitches.
+            untouched2: Variance of the half-space loads on untouched skin, pitch².
         """
-        loaded = variance > (1.0 + DISC_FAINT) * untouched2
-        variance = np.where(loaded, variance, untouched2)
-        self.scale2 = float(variance.mean())
-        self.share[:] = variance / self.scale2
+        loaded = variance[0] > DISC_FAINT * untouched2
+        own = np.where(loaded, variance[0], 0.0) + untouched2
+        self.scale2 = float(own.mean())
+        self.share[:] = own / self.scale2
         rest = untouched2 / self.scale2
-        columns = np.flatnonzero(np.repeat(loaded, 3))
-        part = np.ascontiguousarray(self.response[:, columns])
-        multiply(part * np.repeat(self.share[loaded] - rest, 3), np.ascontiguousarray(part.T), self.covariance)
+        added = np.column_stack([np.repeat(variance[:1], 3, axis=0).T, variance[1]])[loaded] / self.scale2
+        response = self.response.reshape(len(layer), -1, 3)[:, loaded]
+        part = np.concatenate([response, layer[:, loaded, None]], axis=2).reshape(len(layer), -1)
+        multiply(part * added.ravel(), np.ascontiguousarray(part.T), self.covariance)
         self.covariance += rest * self.uniform
         self.covariance[np.diag_indices_from(self.covariance)] += (1.0 - rest) * SLACK**2
         self.doubt, self.smooth_share = DISC_DOUBT, DISC_SHARE

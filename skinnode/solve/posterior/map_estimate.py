@@ -298,8 +298,8 @@ class MapEstimator:
         """Return L⁻¹ y (m,) of the last :meth:`factorise_uniform`."""
         return self._b.v[: self.factored_rows].copy()
 
-    def match(self, data: Float) -> Float:
-        """Return (L⁻¹ J G)ᵀ z (3Q,) for whitened data z (m,), using the current factors."""
+    def match(self, data: Float, response_t: Float) -> Float:
+        """Return (L⁻¹ J G)ᵀ z (C,) for whitened data z (m,) and Gᵀ (C, U f), using the current factors."""
         b, f, rows = self._b, self._free.size, self._rows
         z = data.copy()
         solve_lower_transposed_vector(b.innovation_covariance, z, z.size)
@@ -307,8 +307,8 @@ class MapEstimator:
         for i, u in enumerate(self.members.tolist()):
             block = slice(i * rows, (i + 1) * rows)
             gradient[u * f : (u + 1) * f] = z[block] @ b.jacobian[block]
-        out = np.empty(self.load_prior.response.shape[1])
-        multiply_vector(self.load_prior.response_t, gradient, out)
+        out = np.empty(len(response_t))
+        multiply_vector(response_t, gradient, out)
         return out
 
     def signal(self) -> Float:

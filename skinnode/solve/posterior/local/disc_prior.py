@@ -19,14 +19,22 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.cholesky import multiply
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior.load_cells import MARGIN
 from skinnode.solve.posterior.local import discs as kernels
-from skinnode.solve.posterior.local.discs import PARAMETERS, STEPS, Effects
+from skinnode.solve.posterior.local.discs import LOADS, PARAMETERS, STEPS, Effects
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 EXPECTED: Final = 0.1
 """Expected amplitude a of a disc, in clearances per unit load."""
-AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0, 2.0)
+AMPLITUDE_MOST: Final = 1.6
+"""Maximum ln a, relative to the expected value. A much larger load outside the patch could imitate a plate on the
+whole patch."""
+LAYER_RANGE: Final = (0.02, 5.0)
+"""Minimum and maximum layer share β."""
+BEYOND: Final = 1
+"""Maximum distance of the centre of a disc from the outermost electrodes, cells."""
+AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
 """Distance from the start of a search within which the loads are computed, cells."""
@@ -47,20 +55,35 @@ class DiscPrior:
         estimator: MAP estimator of the patch.
         shape: Numbers of cells across and along the wires.
         clearance: Median clearance, pitches.
+        layer: (U f, Q) displacement per unit load on a bonded layer, pitches.
 
     Attributes:
-        discs: (D, 4) row, column, ln R and ln a of each disc.
+        discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
         spread: (U f,) variance of the displacement due to the choice of the discs, pitch².
     """
 
-    def __init__(self, estimator: MapEstimator, shape: tuple[int, int], clearance: float) -> None:
+    def __init__(
+        self, estimator: MapEstimator, shape: tuple[int, int], clearance: float, layer: Float
+    ) -> None:
         self._estimator, self._prior = estimator, estimator.load_prior
         self._place = np.ascontiguousarray(np.indices(shape).reshape(2, -1).T, np.float64)
-        self._lattice = np.array(shape, np.float64) - 1.0
         self._amplitude = math.log(EXPECTED * clearance)
+        low, high = np.log(kernels.RADIUS_RANGE)
+        first, last = MARGIN - BEYOND, np.array(shape) - 1 - MARGIN + BEYOND
+        self._bounds = np.array(
+            [
+                [first, first, low, -math.inf, math.log(LAYER_RANGE[0])],
+                [*last, high, self._amplitude + AMPLITUDE_MOST, math.log(LAYER_RANGE[1])],
+            ]
+        )
+        self._inside = ((self._place >= self._bounds[0, :2]) & (self._place <= self._bounds[1, :2])).all(axis=1)
         gap = np.linalg.norm(self._place[:, None] - self._place, axis=-1)
         self._near = np.asarray(1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0))))
         self._scratch = kernels.make_scratch(len(self._place))
+        self.layer = layer
+        own = self._prior.response.reshape(len(layer), -1, 3)
+        self._response = np.concatenate([own, layer[..., None]], axis=2).reshape(len(layer), -1)
+        self._response_t = np.ascontiguousarray(self._response.T)
         self.discs: Float = np.empty((0, PARAMETERS))
         self.spread = np.zeros(len(self._prior.response))
 
@@ -70,7 +93,7 @@ class DiscPrior:
         self.spread[:] = 0.0
 
     def fit(self, observation: Observation, members: Index, untouched2: float, uniform2: float) -> Float | None:
-        """Fit the discs to a frame, and return the variances (Q,) of the loads, pitch².
+        """Fit the discs to a frame, and return the variances (2, Q) of the loads, pitch².
 
         The factors of the estimator are overwritten.
 
@@ -98,14 +121,15 @@ class DiscPrior:
             if not gain > PAYS + math.log(PARAMETERS * len(more)):
                 break
             discs = more
+        self.dbg = (least, own + search.evidence, own)
         if own + search.evidence < least or not len(discs):
             self.reset()
             return None
         self.discs = discs
         search.measure_spread(discs)
-        variance = np.empty(len(self._place))
+        variance = np.empty((2, len(self._place)))
         kernels.add_variance(discs, self._place, variance)
-        return variance + untouched2
+        return variance
 
 
 class _Search:
@@ -117,7 +141,7 @@ class _Search:
         self._cells: Index = np.arange(0)
         self._rows = np.empty((len(data), 0))
         self._effects = Effects(np.empty((0, 2)), np.empty((0, 0)), np.empty(0))
-        self._match = self._estimator.match(data)
+        self._match = self._estimator.match(data, prior._response_t)
         self._unit = 0.0
         self.evidence = 0.0
 
@@ -136,9 +160,9 @@ class _Search:
         if len(discs):
             q = np.empty(self._effects.match.size)
             kernels.mean_loads(discs, self._effects, self._p._scratch, q)
-            left = self._estimator.match(self._data - self._rows @ q)
-        square = (self._p._near @ left[2::3]) ** 2
-        best = int(np.argmax(square))
+            left = self._estimator.match(self._data - self._rows @ q, self._p._response_t)
+        square = (self._p._near @ left[2::LOADS]) ** 2
+        best = int(np.argmax(np.where(self._p._inside, square, 0.0)))
         if len(discs) and square[best] < NOTICED * self._unit:
             return None
         return np.asarray(self._p._place[best])
@@ -149,9 +173,10 @@ class _Search:
         self._include(place[None])
         if not len(discs):
             near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._cells]
-            self._unit = float(near @ self._effects.gram[2::3, 2::3] @ near)
+            self._unit = float(near @ self._effects.gram[2::LOADS, 2::LOADS] @ near)
         trials = [
-            np.vstack([discs, [*place, math.log(kernels.RADIUS), p._amplitude + more]]) for more in AMPLITUDES
+            np.vstack([discs, [*place, math.log(kernels.RADIUS), p._amplitude + more, math.log(kernels.LAYER)]])
+            for more in AMPLITUDES
         ]
         first = max(trials, key=lambda trial: kernels.evidence(trial, self._effects, p._scratch))
         found = self._climb(first)
@@ -160,7 +185,7 @@ class _Search:
     def _climb(self, discs: Float) -> Float:
         p, found = self._p, discs.copy()
         self.evidence = kernels.climb(
-            found, self._effects, p._amplitude, p._lattice, found.copy(), p._scratch
+            found, self._effects, p._amplitude, p._bounds, found.copy(), p._scratch
         )
         return found
 
@@ -172,13 +197,13 @@ class _Search:
         if not fresh.size:
             return
         self._cells = np.concatenate([self._cells, fresh])
-        columns = (3 * fresh[:, None] + np.arange(3)).ravel()
+        columns = (LOADS * fresh[:, None] + np.arange(LOADS)).ravel()
         rows = np.empty((len(self._data), columns.size))
-        self._estimator.whiten(np.ascontiguousarray(p._prior.response[:, columns]), rows)
+        self._estimator.whiten(np.ascontiguousarray(p._response[:, columns]), rows)
         self._rows = np.hstack([self._rows, rows])
         gram = np.empty((self._rows.shape[1], self._rows.shape[1]))
         multiply(np.ascontiguousarray(self._rows.T), self._rows, gram)
-        every = (3 * self._cells[:, None] + np.arange(3)).ravel()
+        every = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
         self._effects = Effects(
             np.ascontiguousarray(p._place[self._cells]), gram, np.ascontiguousarray(self._match[every])
         )
@@ -187,8 +212,8 @@ class _Search:
         """Write the variance of the displacement due to each parameter of the discs."""
         p, effects = self._p, self._effects
         own, other = np.empty((2, effects.match.size))
-        columns = (3 * self._cells[:, None] + np.arange(3)).ravel()
-        response = p._prior.response[:, columns]
+        columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
+        response = p._response[:, columns]
         best = kernels.mean_loads(discs, effects, p._scratch, own)
         best += kernels.log_prior(discs, p._amplitude)
         p.spread[:] = 0.0

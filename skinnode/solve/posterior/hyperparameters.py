@@ -44,7 +44,8 @@ which the discs are fitted again."""
 UNTOUCHED: Final = 0.1
 """Load variance expected on untouched skin, relative to the minimum prior variance of equal loads over the whole
 patch (:data:`SCALE_LEAST`)."""
-SPREAD: Final = 1.0
+FAR_LOADS: Final = float(__import__("os").environ.get("KAPPA", "0"))
+SPREAD: Final = float(__import__("os").environ.get("SPREAD", "1"))
 """Factor applied to the variance due to the choice of the discs."""
 REFINEMENTS: Final = 3
 """Maximum number of updates of the expected load locations per frame. Each update costs as much as two
@@ -189,7 +190,8 @@ class Hyperparameters:
         if not uniform and gone < REFIT * float(np.abs(estimator.moved).max()):
             return False
         self._fitted[:] = estimator.moved
-        untouched2 = UNTOUCHED * self._least
+        strongest = float(np.exp(2.0 * discs.discs[:, 3]).max()) if len(discs.discs) else 0.0
+        untouched2 = max(UNTOUCHED * self._least, FAR_LOADS**2 * strongest)
         variance = discs.fit(observation, members, untouched2, prior.scale2 if uniform else self._expected)
         if variance is None:
             prior.spread(prior.scale2 if uniform else self._expected)

@@ -31,9 +31,10 @@ SMOOTH_SHARE: Final = 0.25
 """Factor applied to the part of the variance that depends on the prior, for the 95 % interval. The factor is
 less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
 displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
-DISC_DOUBT: Final = 1.0
+DISC_SLACK: Final = float(__import__("os").environ.get("TAU", "0"))
+DISC_DOUBT: Final = float(__import__("os").environ.get("DOUBT", "1"))
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
-DISC_SHARE: Final = 1.0
+DISC_SHARE: Final = float(__import__("os").environ.get("SHARE", "1"))
 """Value of :data:`SMOOTH_SHARE` for a prior with discs."""
 DISC_FAINT: Final = 0.05
 """Load variance that discs add to a cell, relative to that of untouched skin, below which it is neglected."""
@@ -129,7 +130,9 @@ class LoadPrior:
         response = self.response.reshape(len(layer), -1, 3)[:, loaded]
         part = np.concatenate([response, layer[:, loaded, None]], axis=2).reshape(len(layer), -1)
         multiply(part * added.ravel(), np.ascontiguousarray(part.T), self.covariance)
+        near = DISC_SLACK**2 * self.covariance.diagonal()
         self.covariance += rest * self.uniform
+        self.covariance[np.diag_indices_from(self.covariance)] += near
         self.covariance[np.diag_indices_from(self.covariance)] += (1.0 - rest) * SLACK**2
         self.doubt, self.smooth_share = DISC_DOUBT, DISC_SHARE
         self._made_anew(self.covariance)

@@ -42,7 +42,7 @@ MOST: Final = 4
 """Maximum number of discs."""
 PAYS: Final = 2.0
 """Minimum gain in evidence of a further disc, in addition to the logarithm of the number of parameters."""
-NOTICED: Final = 12.0
+NOTICED: Final = 8.0
 """Minimum squared match of the remaining data with a load, in noise variances, for a further disc to be tried."""
 NEAR: Final = 1.0
 """Radius of the discs with which the data are compared to find a start, cells."""
@@ -113,12 +113,15 @@ class DiscPrior:
         data = estimator.whitened_data()
         search = _Search(self, data)
         discs = search.start(self.discs)
+        rejected: tuple[Float, float] | None = None
         while True:
             place = search.place_of_next(discs)
             if place is None:
                 break
             more, gain = search.with_disc_at(place, discs)
-            if not gain > PAYS + math.log(PARAMETERS * len(more)):
+            excess = gain - PAYS - math.log(PARAMETERS * len(more))
+            if not excess > 0.0:
+                rejected = more, excess
                 break
             discs = more
         self.dbg = (least, own + search.evidence, own)
@@ -127,6 +130,8 @@ class DiscPrior:
             return None
         self.discs = discs
         search.measure_spread(discs)
+        if rejected is not None:
+            search.add_spread_of_rejected(discs, *rejected)
         variance = np.empty((2, len(self._place)))
         kernels.add_variance(discs, self._place, variance)
         return variance
@@ -180,7 +185,10 @@ class _Search:
         ]
         first = max(trials, key=lambda trial: kernels.evidence(trial, self._effects, p._scratch))
         found = self._climb(first)
-        return found, self.evidence - before
+        gain = self.evidence - before
+        if not gain > PAYS + math.log(PARAMETERS * len(found)):
+            self.evidence = before
+        return found, gain
 
     def _climb(self, discs: Float) -> Float:
         p, found = self._p, discs.copy()
@@ -207,6 +215,16 @@ class _Search:
         self._effects = Effects(
             np.ascontiguousarray(p._place[self._cells]), gram, np.ascontiguousarray(self._match[every])
         )
+
+    def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
+        """Add the variance due to a disc that may exist, although the evidence did not pay for it."""
+        p, effects = self._p, self._effects
+        own, other = np.empty((2, effects.match.size))
+        kernels.mean_loads(discs, effects, p._scratch, own)
+        kernels.mean_loads(more, effects, p._scratch, other)
+        columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
+        chance = 1.0 / (1.0 + math.exp(-excess))
+        p.spread += chance * (1.0 - chance) * (p._response[:, columns] @ (other - own)) ** 2
 
     def measure_spread(self, discs: Float) -> None:
         """Write the variance of the displacement due to each parameter of the discs."""

@@ -7,5 +7,6 @@ Data flow through the modules in this order; ``methods`` sets up the solvers for
 Each subcommand of ``skinnode bench`` has a module whose function ``run`` returns the results as built-in
 types. ``skinnode.cli.bench`` prints the results and writes them to files. ``truth`` simulates presses with
 closed-form models that share no assumptions with the solvers. ``load``, ``scale``, ``soak`` and
-``trust_road`` use the simulator, in which complete nodes generate the CAN frames.
+``trust_road`` use the simulator, in which complete nodes generate the CAN frames. ``family_scenes`` uses
+only its contact mechanics.
 """

@@ -64,10 +64,9 @@ def draw(
         depth: Depth divided by the height of the upper layer; by default, it is random.
     """
     layout = skin.layout
-    if family == "two":
-        loads = _pair(layout, rng, depth)
-    else:
-        loads = (trust_loads.draw(family, layout, rng, depth),)
+    loads: tuple[Load, ...] = (
+        _pair(layout, rng, depth) if family == "two" else (trust_loads.draw(family, layout, rng, depth),)
+    )
     centers = tuple((float(load.center_m[0]), float(load.center_m[1])) for load in loads)
     if bonded and family in BONDED:
         kind = "sphere" if family in ("edge", "two") else family
@@ -78,7 +77,6 @@ def draw(
 
 def _pair(layout: PatchLayout, rng: np.random.Generator, depth: float | None) -> tuple[Load, Load]:
     """Return two spheres at a distance within :data:`APART`."""
-    _, low, high = trust_loads.surface_m(layout)
     while True:
         first, second = (trust_loads.draw("sphere", layout, rng, depth) for _ in range(2))
         gap = np.subtract(second.center_m, first.center_m)
@@ -97,7 +95,7 @@ def _on_layer(kind: str, layout: PatchLayout, loads: tuple[Load, ...], rng: np.r
     pitch = layout.pitch_m
     thickness = float(rng.choice(THICKNESSES)) * layout.height_m
     _, low, high = trust_loads.surface_m(layout)
-    cells = tuple(int(round(n)) for n in ((high - low) / pitch + 2 * MARGIN) * FINE + 1)
+    cells = tuple(round(float(n)) for n in ((high - low) / pitch + 2 * MARGIN) * FINE + 1)
     grid = _grid(thickness, (cells[0], cells[1]), pitch / FINE)
     place = grid.centres_m(low - MARGIN * pitch)
     overlap = np.full(grid.shape, -np.inf)

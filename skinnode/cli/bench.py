@@ -6,7 +6,7 @@ Ratios compare times from the same run, because absolute times depend on the mac
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -185,6 +185,13 @@ def accuracy(
         int, typer.Option(min=1, help="Number of random scenes per row of the coverage table.")
     ] = 200,
     rounds: Rounds = 31,
+    only: Annotated[
+        Literal["families"] | None,
+        typer.Option(
+            help="Run only this part: families of loads that the prior does not expect, with each prior. "
+            "Then --scenes counts the scenes of a family for each layout and noise."
+        ),
+    ] = None,
 ) -> None:
     """Measure the displacement error as a function of solve time, noise and code width.
 
@@ -195,7 +202,12 @@ def accuracy(
     from skinnode.bench import accuracy as bench
 
     _prepare(json, plot)
-    figures = bench.run(scenes, rounds)
+    if only == "families":
+        if plot is not None:
+            raise typer.BadParameter("got --plot, which --only families does not draw", param_hint="--plot")
+        figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
+    else:
+        figures = bench.run(scenes, rounds)
     _print_machine(figures)
     bench.print_all(figures, typer.echo)
     _write(json, figures)

@@ -440,8 +440,7 @@ class FrameEstimator:
     def _data_share(self) -> Float:
         """Return the data share (U, 3N) of each coordinate; 0 for coordinates that are not free."""
         prior, share = self._estimator.load_prior, np.zeros_like(self._trusted)
-        variance = prior.scale2 * prior.covariance.diagonal()
-        share[:, self._free] = data_share(self._estimator.std, self._estimator.core, variance)
+        share[:, self._free] = data_share(self._estimator.std, self._estimator.core, prior)
         return share
 
     def _field(

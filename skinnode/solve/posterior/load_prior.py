@@ -31,10 +31,13 @@ SMOOTH_SHARE: Final = 0.25
 """Factor applied to the part of the variance that depends on the prior, for the 95 % interval. The factor is
 less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
 displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
-DISC_SLACK: Final = float(__import__("os").environ.get("TAU", "0"))
-DISC_DOUBT: Final = float(__import__("os").environ.get("DOUBT", "1"))
+DISC_SLACK: Final = 0.07
+"""Standard deviation of the displacement that discs cause but no load explains, independently at each
+electrode, relative to the displacement expected there. Without it, errors of dents and of presses on a
+bonded layer exceeded five standard deviations in one scene of ten."""
+DISC_DOUBT: Final = 2.5
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
-DISC_SHARE: Final = float(__import__("os").environ.get("SHARE", "1"))
+DISC_SHARE: Final = 0.8
 """Value of :data:`SMOOTH_SHARE` for a prior with discs."""
 DISC_FAINT: Final = 0.05
 """Load variance that discs add to a cell, relative to that of untouched skin, below which it is neglected."""
@@ -68,6 +71,8 @@ class LoadPrior:
         covariance: (U f, U f) matrix C.
         uniform: (U f, U f) matrix C for equal expected loads over the whole patch.
         response: (U f, 3Q) displacement per unit load, pitches.
+        doubt: Factor applied to the part of the variance that depends on the prior.
+        smooth_share: Value of ``doubt`` for the 95 % interval.
         version: Number of times that C has been rebuilt.
     """
 

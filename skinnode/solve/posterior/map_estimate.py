@@ -70,7 +70,6 @@ HALVINGS: Final = 6
 """Maximum number of times that a Gauss-Newton step is halved."""
 
 
-
 class MapEstimator:
     """MAP estimator of one patch, with its displacement, nuisances and last factors.
 
@@ -280,8 +279,8 @@ class MapEstimator:
     def factorise_uniform(self, observation: Observation, scale2: float) -> float:
         """Factorise S for equal loads over the whole patch with s² = ``scale2``; return the log evidence.
 
-        The evidence is that of the last :meth:`linearise`, ln N(y; 0, S) without the constant term. The factors
-        remain until the next step of a solve.
+        The evidence is that of the last :meth:`linearise`, ln N(y; 0, S) without the constant term. The
+        factors remain until the next step of a solve.
         """
         b, m = self._b, self.factored_rows
         self._assemble(observation, self.members, scale2, self.moved, self.load_prior.uniform)
@@ -397,7 +396,7 @@ class MapEstimator:
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
         b.effect[:] = 0.0  # geometry errors have no effect at rest
 
-    def _assemble(  # noqa: PLR0913 - the frame, the prior and the point of linearisation
+    def _assemble(
         self,
         observation: Observation,
         members: Index,

@@ -1,10 +1,10 @@
 """Fit of soft discs of loads to a frame.
 
-The data are linearised at the current displacement, and whitened with the covariance that they would have on an
-untouched skin, whose loads are equally small everywhere. The first disc is placed where the whitened data agree
-best with a load, and fitted (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where the data
-that remain agree best with a load, as long as the evidence pays for their parameters. In a stream, the search
-starts at the discs of the last frame.
+The data are linearised at the current displacement, and whitened with the covariance that they would have on
+an untouched skin, whose loads are equally small everywhere. The first disc is placed where the whitened data
+agree best with a load, and fitted (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added
+where the data that remain agree best with a load, as long as the evidence pays for their parameters. In a
+stream, the search starts at the discs of the last frame.
 
 If equal loads over the whole patch explain the frame better than the discs, no disc is used.
 """
@@ -28,8 +28,8 @@ from skinnode.solve.posterior.observation import Observation
 EXPECTED: Final = 0.1
 """Expected amplitude a of a disc, in clearances per unit load."""
 AMPLITUDE_MOST: Final = 1.6
-"""Maximum ln a, relative to the expected value. A much larger load outside the patch could imitate a plate on the
-whole patch."""
+"""Maximum ln a, relative to the expected value. A much larger load outside the patch could imitate a plate
+on the whole patch."""
 LAYER_RANGE: Final = (0.02, 5.0)
 """Minimum and maximum layer share β."""
 BEYOND: Final = 1
@@ -38,12 +38,13 @@ AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
 """Distance from the start of a search within which the loads are computed, cells."""
-MOST: Final = 4
+MOST: Final = 3
 """Maximum number of discs."""
 PAYS: Final = 2.0
 """Minimum gain in evidence of a further disc, in addition to the logarithm of the number of parameters."""
 NOTICED: Final = 8.0
-"""Minimum squared match of the remaining data with a load, in noise variances, for a further disc to be tried."""
+"""Minimum squared match of the remaining data with a load, in noise variances, for a further disc to be
+tried."""
 NEAR: Final = 1.0
 """Radius of the discs with which the data are compared to find a start, cells."""
 
@@ -76,9 +77,13 @@ class DiscPrior:
                 [*last, high, self._amplitude + AMPLITUDE_MOST, math.log(LAYER_RANGE[1])],
             ]
         )
-        self._inside = ((self._place >= self._bounds[0, :2]) & (self._place <= self._bounds[1, :2])).all(axis=1)
+        self._inside = ((self._place >= self._bounds[0, :2]) & (self._place <= self._bounds[1, :2])).all(
+            axis=1
+        )
         gap = np.linalg.norm(self._place[:, None] - self._place, axis=-1)
-        self._near = np.asarray(1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0))))
+        self._near = np.asarray(
+            1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0)))
+        )
         self._scratch = kernels.make_scratch(len(self._place))
         self.layer = layer
         own = self._prior.response.reshape(len(layer), -1, 3)
@@ -92,7 +97,15 @@ class DiscPrior:
         self.discs = np.empty((0, PARAMETERS))
         self.spread[:] = 0.0
 
-    def fit(self, observation: Observation, members: Index, untouched2: float, uniform2: float) -> Float | None:
+    def fit(
+        self,
+        observation: Observation,
+        members: Index,
+        untouched2: float,
+        uniform2: float,
+        *,
+        spread: bool,
+    ) -> Float | None:
         """Fit the discs to a frame, and return the variances (2, Q) of the loads, pitch².
 
         The factors of the estimator are overwritten.
@@ -102,6 +115,7 @@ class DiscPrior:
             members: Wires whose equations are used.
             untouched2: s² of the loads on untouched skin, pitch².
             uniform2: s² of equal loads over the whole patch, pitch².
+            spread: Whether to compute :attr:`spread` as well.
 
         Returns:
             The variances; None if equal loads over the whole patch are more likely.
@@ -124,13 +138,14 @@ class DiscPrior:
                 rejected = more, excess
                 break
             discs = more
-        self.dbg = (least, own + search.evidence, own)
         if own + search.evidence < least or not len(discs):
             self.reset()
             return None
         self.discs = discs
-        search.measure_spread(discs)
-        if rejected is not None:
+        self.spread[:] = 0.0
+        if spread:
+            search.measure_spread(discs)
+        if spread and rejected is not None:
             search.add_spread_of_rejected(discs, *rejected)
         variance = np.empty((2, len(self._place)))
         kernels.add_variance(discs, self._place, variance)
@@ -142,7 +157,7 @@ class _Search:
 
     def __init__(self, prior: DiscPrior, data: Float) -> None:
         self._p, self._data = prior, data
-        self._estimator = prior._estimator  # noqa: SLF001 - part of DiscPrior
+        self._estimator = prior._estimator
         self._cells: Index = np.arange(0)
         self._rows = np.empty((len(data), 0))
         self._effects = Effects(np.empty((0, 2)), np.empty((0, 0)), np.empty(0))
@@ -155,7 +170,7 @@ class _Search:
         if not len(discs):
             return discs
         self._include(discs[:, :2])
-        return self._climb(discs)
+        return self._climb(discs, 0)
 
     def place_of_next(self, discs: Float) -> Float | None:
         """Return the cell (2,) where a further disc may be needed, or None."""
@@ -180,20 +195,25 @@ class _Search:
             near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._cells]
             self._unit = float(near @ self._effects.gram[2::LOADS, 2::LOADS] @ near)
         trials = [
-            np.vstack([discs, [*place, math.log(kernels.RADIUS), p._amplitude + more, math.log(kernels.LAYER)]])
+            np.vstack(
+                [discs, [*place, math.log(kernels.RADIUS), p._amplitude + more, math.log(kernels.LAYER)]]
+            )
             for more in AMPLITUDES
         ]
         first = max(trials, key=lambda trial: kernels.evidence(trial, self._effects, p._scratch))
-        found = self._climb(first)
+        found = self._climb(first, len(discs))
         gain = self.evidence - before
+        if len(discs) and gain > PAYS + math.log(PARAMETERS * len(found)):
+            found = self._climb(found, 0)
+            gain = self.evidence - before
         if not gain > PAYS + math.log(PARAMETERS * len(found)):
             self.evidence = before
         return found, gain
 
-    def _climb(self, discs: Float) -> Float:
+    def _climb(self, discs: Float, first: int) -> Float:
         p, found = self._p, discs.copy()
         self.evidence = kernels.climb(
-            found, self._effects, p._amplitude, p._bounds, found.copy(), p._scratch
+            found, first, self._effects, p._amplitude, p._bounds, found.copy(), p._scratch
         )
         return found
 
@@ -234,7 +254,6 @@ class _Search:
         response = p._response[:, columns]
         best = kernels.mean_loads(discs, effects, p._scratch, own)
         best += kernels.log_prior(discs, p._amplitude)
-        p.spread[:] = 0.0
         for d in range(len(discs)):
             for parameter in range(PARAMETERS):
                 weights, shifts = [1.0], [np.zeros(len(response))]

@@ -1,16 +1,17 @@
 """Soft discs of loads: variance, evidence and search.
 
-A cell has four loads: two shear loads and a normal load on a half-space, and a normal load on a thin bonded layer.
-The last one moves the skin only near the cell, and stands for all displacements that no load on a half-space can
-cause. A disc d has a centre (row, column) and a radius R in cells, an amplitude a in units of the prior's loads, and
-a layer share β. It adds the variance a² w to the half-space loads of each cell, and a² β² w to the layer load, where
+A cell has four loads: two shear loads and a normal load on a half-space, and a normal load on a thin bonded
+layer. The last one moves the skin only near the cell, and stands for all displacements that no load on a
+half-space can cause. A disc d has a centre (row, column) and a radius R in cells, an amplitude a in units of
+the prior's loads, and a layer share β. It adds the variance a² w to the half-space loads of each cell, and
+a² β² w to the layer load, where
 
     w = 1 / (1 + exp((r − R − ¼) / ¼)),   r: distance of the cell from the centre
 
 The loads of all discs together have the variances v. Let b = BᵀL⁻¹y and M = BᵀB, where B = L⁻¹ J G are the
-whitened effects of the loads on the data y, and L Lᵀ is the covariance of the data of an untouched skin. By the
-Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an untouched
-skin by
+whitened effects of the loads on the data y, and L Lᵀ is the covariance of the data of an untouched skin. By
+the Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an
+untouched skin by
 
     ½ |Λ⁻¹ V b|² − ln |Λ|,   Λ Λᵀ = I + V M V,   V = diag(√v)
 
@@ -33,7 +34,7 @@ from skinnode.solve.linalg.vectors import Index
 
 SOFT: Final = 0.25
 """Width of the rim of a disc, cells."""
-FAINT: Final = 1e-3
+FAINT: Final = 0.03
 """Variance of a cell, relative to the largest, below which its loads are neglected in the evidence."""
 RADIUS: Final = 1.5
 """Expected radius of a disc, cells."""
@@ -49,8 +50,9 @@ LAYER_SPREAD: Final = 1.5
 """Standard deviation of ln β in the prior of a disc."""
 STEPS: Final = (0.5, 0.5, 0.3, 0.5, 1.0)
 """First steps of the search in the row, column, ln R, ln a and ln β of a disc."""
-SWEEPS: Final = 4
-"""Maximum number of sweeps over all parameters. After a sweep without an improvement, the steps are halved."""
+SWEEPS: Final = 3
+"""Maximum number of sweeps over all parameters. After a sweep without an improvement, the steps are
+halved."""
 WORTH: Final = 0.05
 """Minimum gain in log-likelihood for a step to be taken."""
 PARAMETERS: Final = 5
@@ -73,8 +75,8 @@ class Effects(NamedTuple):
 class Scratch(NamedTuple):
     """Work arrays for up to n cells."""
 
-    variance: Float
-    """(2, n) variances of the half-space loads and of the layer load of each cell."""
+    root: Float
+    """(2, n) standard deviations of the half-space loads and of the layer load of each cell."""
     cells: Index
     """(n,) cells with loads."""
     factor: Float
@@ -109,24 +111,28 @@ def add_variance(discs: Float, place: Float, variance: Float) -> None:
 def _factorise(discs: Float, effects: Effects, s: Scratch) -> int:
     """Factorise I + V M V and solve for Λ⁻¹ V b; return the number of loaded cells, or −1 on failure."""
     n = effects.place.shape[0]
-    add_variance(discs, effects.place, s.variance)
+    add_variance(discs, effects.place, s.root)
     most = 0.0
     for cell in range(n):
-        most = max(most, s.variance[0, cell])
+        most = max(most, s.root[0, cell])
     count = 0
     for cell in range(n):
-        if s.variance[0, cell] > FAINT * most:
+        if s.root[0, cell] > FAINT * most:
             s.cells[count] = cell
             count += 1
+        s.root[0, cell], s.root[1, cell] = (
+            math.sqrt(s.root[0, cell]),
+            math.sqrt(s.root[1, cell]),
+        )
     for i in range(count):
         at = LOADS * s.cells[i]
         for t in range(LOADS):
-            root = math.sqrt(s.variance[t // 3, s.cells[i]])
+            root = s.root[t // 3, s.cells[i]]
             row, source = s.factor[LOADS * i + t], effects.gram[at + t]
             s.vector[LOADS * i + t] = root * effects.match[at + t]
             for j in range(i, count):
                 cell = s.cells[j]
-                other, layer = root * math.sqrt(s.variance[0, cell]), root * math.sqrt(s.variance[1, cell])
+                other, layer = root * s.root[0, cell], root * s.root[1, cell]
                 to, start = LOADS * j, LOADS * cell
                 row[to] = other * source[start]
                 row[to + 1] = other * source[start + 1]
@@ -171,13 +177,13 @@ def mean_loads(discs: Float, effects: Effects, s: Scratch, q: Float) -> float:
     solve_lower_transposed_vector(s.factor, s.vector, LOADS * count)
     for i in range(count):
         for t in range(LOADS):
-            q[LOADS * s.cells[i] + t] = math.sqrt(s.variance[t // 3, s.cells[i]]) * s.vector[LOADS * i + t]
+            q[LOADS * s.cells[i] + t] = s.root[t // 3, s.cells[i]] * s.vector[LOADS * i + t]
     return total
 
 
 @njit
 def log_prior(discs: Float, amplitude: float) -> float:
-    """Return the log prior density of ``discs`` (D, 5), up to a constant; ``amplitude`` is the expected ln a."""
+    """Return the log prior density of ``discs`` (D, 5) up to a constant, for an expected ln a ``amplitude``."""
     total = 0.0
     for d in range(discs.shape[0]):
         wide = (math.log(math.exp(discs[d, 2]) + SOFT) - math.log(RADIUS)) / RADIUS_SPREAD
@@ -189,17 +195,20 @@ def log_prior(discs: Float, amplitude: float) -> float:
 
 @njit_part
 def _allowed(value: float, parameter: int, bounds: Float) -> float:
-    return min(max(value, bounds[0, parameter]), bounds[1, parameter])
+    low: float = bounds[0, parameter]
+    high: float = bounds[1, parameter]
+    return min(max(value, low), high)
 
 
 @njit
 def climb(  # noqa: PLR0913 - a kernel: arrays by name
-    discs: Float, effects: Effects, amplitude: float, bounds: Float, trial: Float, s: Scratch
+    discs: Float, first: int, effects: Effects, amplitude: float, bounds: Float, trial: Float, s: Scratch
 ) -> float:
     """Improve the discs (D, 5) in place by a coordinate search; return their evidence plus log prior.
 
     Args:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
+        first: Index of the first disc to improve; those before it stay as they are.
         effects: Effects of the loads on the data.
         amplitude: Expected ln a.
         bounds: (2, 5) minimum and maximum of each parameter.
@@ -210,7 +219,7 @@ def climb(  # noqa: PLR0913 - a kernel: arrays by name
     scale = 1.0
     for _ in range(SWEEPS):
         better = False
-        for d in range(discs.shape[0]):
+        for d in range(first, discs.shape[0]):
             for p in range(PARAMETERS):
                 taken = False
                 for sign in range(2):

@@ -6,7 +6,8 @@ agree best with a load, and fitted (:mod:`skinnode.solve.posterior.local.discs`)
 where the data that remain agree best with a load, as long as the evidence pays for their parameters. In a
 stream, the search starts at the discs of the last frame.
 
-If equal loads over the whole patch explain the frame better than the discs, no disc is used.
+If equal loads over the whole patch explain the frame better than the discs, or if the loads need many or large
+discs, no disc is used.
 """
 
 from __future__ import annotations
@@ -38,8 +39,11 @@ AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
 """Distance from the start of a search within which the loads are computed, cells."""
-MOST: Final = 3
-"""Maximum number of discs."""
+MOST: Final = 4
+"""Number of discs at which the search is given up. Loads that need so many discs are not local."""
+WIDE: Final = 3.0
+"""Radius of a disc, cells, above which the search is given up. On large contacts and plates, discs would claim too
+small standard deviations."""
 PAYS: Final = 2.0
 """Minimum gain in evidence of a further disc, in addition to the logarithm of the number of parameters."""
 NOTICED: Final = 8.0
@@ -118,7 +122,7 @@ class DiscPrior:
             spread: Whether to compute :attr:`spread` as well.
 
         Returns:
-            The variances; None if equal loads over the whole patch are more likely.
+            The variances; None if the loads are not local.
         """
         estimator = self._estimator
         estimator.linearise(observation, members)
@@ -138,7 +142,8 @@ class DiscPrior:
                 rejected = more, excess
                 break
             discs = more
-        if own + search.evidence < least or not len(discs):
+        wide = len(discs) == MOST or bool((discs[:, 2] > math.log(WIDE)).any())
+        if own + search.evidence < least or not len(discs) or wide:
             self.reset()
             return None
         self.discs = discs

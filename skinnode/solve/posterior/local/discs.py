@@ -183,7 +183,7 @@ def mean_loads(discs: Float, effects: Effects, s: Scratch, q: Float) -> float:
 
 @njit
 def log_prior(discs: Float, amplitude: float) -> float:
-    """Return the log prior density of ``discs`` (D, 5) up to a constant, for an expected ln a ``amplitude``."""
+    """Return the log prior density of ``discs`` (D, 5) for an expected ln a ``amplitude``."""
     total = 0.0
     for d in range(discs.shape[0]):
         wide = (math.log(math.exp(discs[d, 2]) + SOFT) - math.log(RADIUS)) / RADIUS_SPREAD

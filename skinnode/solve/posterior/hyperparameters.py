@@ -110,11 +110,22 @@ class Hyperparameters:
             self.discs.reset()
 
     def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
-        """Return standard deviations (U, f) that include the uncertainty of the discs, pitches."""
+        """Return standard deviations (U, f) that include the uncertainty of the discs, pitches.
+
+        The first also allows for a further touch that is too light to be found.
+        """
         if self.discs is None:
             return std, core
+        prior = self._prior
         spread = self.discs.spread.reshape(std.shape)
-        return np.sqrt(std**2 + spread), np.sqrt(core**2 + spread)
+        missed = np.zeros_like(std)
+        known = np.isfinite(std)
+        if len(self.discs.discs):
+            unseen = (std[known] ** 2 - core[known] ** 2) / (prior.doubt - prior.smooth_share)
+            expected = (prior.scale2 * prior.covariance.diagonal()).reshape(std.shape)[known]
+            light = self._least * prior.uniform.diagonal().reshape(std.shape)[known]
+            missed[known] = light * np.minimum(unseen / expected, 1.0)
+        return np.sqrt(std**2 + spread + missed), np.sqrt(core**2 + spread)
 
     def set_least(self, observation: Observation) -> None:
         """Set the minimum prior scale from the noise of a frame."""

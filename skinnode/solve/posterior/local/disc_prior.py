@@ -6,8 +6,8 @@ agree best with a load, and fitted (:mod:`skinnode.solve.posterior.local.discs`)
 where the data that remain agree best with a load, as long as the evidence pays for their parameters. In a
 stream, the search starts at the discs of the last frame.
 
-If equal loads over the whole patch explain the frame better than the discs, or if the loads need many or large
-discs, no disc is used.
+If equal loads over the whole patch explain the frame better than the discs, or if the loads need many or
+large discs, no disc is used.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ REACH: Final = 4.5
 MOST: Final = 4
 """Number of discs at which the search is given up. Loads that need so many discs are not local."""
 WIDE: Final = 3.0
-"""Radius of a disc, cells, above which the search is given up. On large contacts and plates, discs would claim too
-small standard deviations."""
+"""Radius of a disc, cells, above which the search is given up. On large contacts and plates, discs would
+claim too small standard deviations."""
 PAYS: Final = 2.0
 """Minimum gain in evidence of a further disc, in addition to the logarithm of the number of parameters."""
 NOTICED: Final = 8.0

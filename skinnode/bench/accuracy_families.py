@@ -197,10 +197,10 @@ def _solve(prior: str, layout: tuple[str, float], sigma: float, scenes: int) -> 
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement on the default prior: its name, value, limit, and whether it is met."""
+    """Return one row per requirement on the prior with discs: its name, value, limit, and whether it is met."""
     found = []
     for each in figures["families"]:
-        if each["prior"] != PRIORS[0]:
+        if each["prior"] != "discs":
             continue
         name = each["family"]
         for part in ("moved", "rest"):

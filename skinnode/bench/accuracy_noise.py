@@ -23,7 +23,7 @@ from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, s
 from skinnode.model.frames import Z_95_TWO_SIDED, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.posterior.load_prior import DISC_DOUBT, DISC_SHARE
+from skinnode.solve.posterior.load_prior import PRIOR_DOUBT, SMOOTH_SHARE
 
 METHODS: Final = ("exact", "posterior")
 SIGMAS: Final = (1e-6, 4e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -103,9 +103,9 @@ class Parts:
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
         wide, core = frame.displacement_std_m[used] ** 2, frame.core_std_m[used] ** 2
-        left = (wide - core) / (DISC_DOUBT - DISC_SHARE)
+        left = (wide - core) / (PRIOR_DOUBT - SMOOTH_SHARE)
         self._error.append(np.abs(frame.displacement_m - truth_m)[used].ravel())
-        self._noise.append((wide - DISC_DOUBT * left).ravel())
+        self._noise.append((wide - PRIOR_DOUBT * left).ravel())
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ from skinnode.model.tolerances import Tolerances
 from skinnode.solve.inputs import CodeMap
 
 TRACKER_METHODS: Final = ("auto", "exact", "posterior")
-PRIORS: Final = ("discs", "cells")
+PRIORS: Final = ("cells", "discs")
 DRIFTS: Final = ("none", "patch", "wire")
 
 
@@ -55,9 +55,10 @@ class EstimateOptions:
             noise.
         deadline_us: Time limit of an update, µs; an update can exceed it by the time of one solver step.
             Wires that are unsolved at the deadline have the status DEADLINE.
-        prior: Where the posterior expects loads once it has found a touch: ``discs`` for a few soft discs,
-            which the evidence of the frame determines, or ``cells`` for one variance per cell. If neither
-            explains a frame better than equal loads over the whole patch, ``discs`` uses ``cells``.
+        prior: Where the posterior expects loads once it has found a touch: ``cells`` for one variance per
+            cell, or ``discs`` for a few soft discs, which the evidence of the frame determines. With ``discs``,
+            errors are smaller, but with ``model_error`` the standard deviations are too small. If the loads
+            are not local, ``discs`` uses ``cells``.
 
     Raises:
         ValueError: If an option is out of range.
@@ -77,7 +78,7 @@ class EstimateOptions:
     normal_only: bool = False
     hold: bool = True
     deadline_us: float | None = None
-    prior: str = "discs"
+    prior: str = "cells"
 
     def __post_init__(self) -> None:
         if self.drift not in DRIFTS:

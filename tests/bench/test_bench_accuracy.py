@@ -64,8 +64,8 @@ def test_errors_are_told_by_the_part_they_come_from() -> None:
     for _ in range(30):
         error = np.sqrt(n + 0.1 * b) * random.standard_normal(TRUTH.shape)
         error[3] = 1.0  # a wire that does not claim to be solved
-        field = frame(error, np.sqrt(n + noise.DISC_DOUBT * b), bad=(3,))
-        core = np.full(TRUTH.shape, np.sqrt(n + noise.DISC_SHARE * b))
+        field = frame(error, np.sqrt(n + noise.PRIOR_DOUBT * b), bad=(3,))
+        core = np.full(TRUTH.shape, np.sqrt(n + noise.SMOOTH_SHARE * b))
         parts.add(dataclasses.replace(field, core_std_m=core), TRUTH)
         parts.add(dataclasses.replace(field, core_std_m=core, held=np.ones(10, bool)), TRUTH + 1.0)
         parts.add(field, TRUTH + 1.0)  # no prior, no part of it

@@ -68,7 +68,12 @@ def solved(skin: Skin, moved: np.ndarray, sigma: float, seed: int, **options) ->
     random = np.random.default_rng(seed)
     frame = skin.resistance_ohm(moved) * (1 + sigma * random.standard_normal(skin.layout.shape))
     posterior = sk.Posterior(
-        skin.layout, relative_noise=sigma, baseline_ohm=skin.rest_ohm, follow_noise=False, **options
+        skin.layout,
+        relative_noise=sigma,
+        baseline_ohm=skin.rest_ohm,
+        follow_noise=False,
+        prior="discs",
+        **options,
     )
     return posterior.update(frame)
 
@@ -85,7 +90,12 @@ def test_the_covariance_is_that_of_dense_algebra_with_the_prior_of_the_discs():
     moved = np.zeros(layout.upper_m.shape)
     moved[1:3, 2, 2] = -0.2 * layout.height_m
     posterior = sk.Posterior(
-        layout, relative_noise=sigma, baseline_ohm=small.rest_ohm, follow_noise=False, hold=False
+        layout,
+        relative_noise=sigma,
+        baseline_ohm=small.rest_ohm,
+        follow_noise=False,
+        hold=False,
+        prior="discs",
     )
     field = posterior.update(small.resistance_ohm(moved))
     prior, pitch = posterior._estimator.load_prior, layout.pitch_m
@@ -150,7 +160,7 @@ def test_a_deep_press_between_two_frames_is_not_taken_for_another_field(skin, si
 
 def test_lost_and_impossible_readings_are_not_trusted(skin):
     scene = family_scenes.draw("sphere", skin, np.random.default_rng(1), depth=0.2)
-    posterior = sk.Posterior(skin.layout, relative_noise=1e-3, baseline_ohm=skin.rest_ohm)
+    posterior = sk.Posterior(skin.layout, relative_noise=1e-3, baseline_ohm=skin.rest_ohm, prior="discs")
     first = posterior.update(skin.resistance_ohm(scene.truth_m))
     assert first.trusted
     for lost in (np.full(skin.layout.shape, np.nan), np.zeros(skin.layout.shape)):
@@ -166,7 +176,9 @@ def test_lost_and_impossible_readings_are_not_trusted(skin):
 
 def test_a_released_patch_returns_to_rest_and_forgets_the_discs(skin):
     scene = family_scenes.draw("sphere", skin, np.random.default_rng(2), depth=0.2)
-    posterior = sk.Posterior(skin.layout, relative_noise=1e-3, baseline_ohm=skin.rest_ohm, follow_noise=False)
+    posterior = sk.Posterior(
+        skin.layout, relative_noise=1e-3, baseline_ohm=skin.rest_ohm, follow_noise=False, prior="discs"
+    )
     random = np.random.default_rng(4)
     for share in (1.0, 1.0, 0.0, 0.0):
         noise = 1 + 1e-3 * random.standard_normal(skin.layout.shape)
@@ -176,5 +188,5 @@ def test_a_released_patch_returns_to_rest_and_forgets_the_discs(skin):
 
 
 def test_an_unknown_prior_is_refused(skin):
-    with pytest.raises(ValueError, match="prior: got 'disc', must be one of discs, cells"):
+    with pytest.raises(ValueError, match="prior: got 'disc', must be one of cells, discs"):
         sk.Posterior(skin.layout, prior="disc")

@@ -197,7 +197,7 @@ def _solve(prior: str, layout: tuple[str, float], sigma: float, scenes: int) -> 
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement on the prior with discs: its name, value, limit, and whether it is met."""
+    """Return one row per requirement on the prior with discs: name, value, limit, and whether it is met."""
     found = []
     for each in figures["families"]:
         if each["prior"] != "discs":

@@ -56,9 +56,9 @@ class EstimateOptions:
         deadline_us: Time limit of an update, µs; an update can exceed it by the time of one solver step.
             Wires that are unsolved at the deadline have the status DEADLINE.
         prior: Where the posterior expects loads once it has found a touch: ``cells`` for one variance per
-            cell, or ``discs`` for a few soft discs, which the evidence of the frame determines. With ``discs``,
-            errors are smaller, but with ``model_error`` the standard deviations are too small. If the loads
-            are not local, ``discs`` uses ``cells``.
+            cell, or ``discs`` for a few soft discs, which the evidence of the frame determines. With
+            ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
+            the loads are not local, ``discs`` uses ``cells``.
 
     Raises:
         ValueError: If an option is out of range.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
+from skinnode.bench import accuracy_families as families
 from skinnode.bench import accuracy_front as front
 from skinnode.bench import accuracy_noise as noise
 from skinnode.bench import accuracy_time as times
@@ -43,6 +44,20 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
         "time": times.run(rounds),
     }
     figures["must"] = requirements(figures)
+    found: dict[str, Any] = plain(figures)
+    return found
+
+
+def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
+    """Run only the families of loads that the prior does not expect, and return the results.
+
+    Args:
+        scenes: Number of scenes of each family for each layout and noise.
+        echo: Function that prints a line about the progress.
+    """
+    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
+    figures |= families.run(scenes, echo)
+    figures["must"] = families.requirements(figures)
     found: dict[str, Any] = plain(figures)
     return found
 
@@ -86,11 +101,19 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     """Print the tables."""
+    if "families" in figures:
+        families.print_all(figures, echo)
+        _print_must(figures, echo)
+        return
     _print_front(figures["front"], echo)
     _print_noise(figures["noise"], echo)
     _print_codes(figures["codes"], echo)
     _print_coverage(figures["coverage"], echo)
     _print_parts(figures["parts"], echo)
+    _print_must(figures, echo)
+
+
+def _print_must(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     echo("\nrequirements")
     for row in figures["must"]:
         value = "-" if row["value"] is None else f"{row['value']:.3g}"

@@ -23,7 +23,7 @@ from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, s
 from skinnode.model.frames import Z_95_TWO_SIDED, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE
+from skinnode.solve.posterior.load_prior import PRIOR_DOUBT, SMOOTH_SHARE
 
 METHODS: Final = ("exact", "posterior")
 SIGMAS: Final = (1e-6, 4e-6, 1e-5, 1e-4, 1e-3, 1e-2)

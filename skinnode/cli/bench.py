@@ -185,7 +185,11 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
     only: Annotated[
-        Literal["detection"] | None, typer.Option(help="Measure only the touch detector.")
+        Literal["detection", "families"] | None,
+        typer.Option(
+            help="Run only this part: the touch detector, or families of loads that no prior expects, with each "
+            "prior. For families, --scenes counts the scenes of a family for each layout and noise."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,
     presses: Annotated[
@@ -208,7 +212,12 @@ def accuracy(
     from skinnode.bench import accuracy as bench
 
     _prepare(json, plot)
-    figures = bench.run(scenes, rounds)
+    if only == "families":
+        if plot is not None:
+            raise typer.BadParameter("got --plot, which --only families does not draw", param_hint="--plot")
+        figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
+    else:
+        figures = bench.run(scenes, rounds)
     _print_machine(figures)
     bench.print_all(figures, typer.echo)
     _write(json, figures)

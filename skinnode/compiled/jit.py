@@ -34,6 +34,7 @@ _KERNEL_FILES = (
     "model/kernels.py",
     "solve/*.py",
     "solve/*/*.py",
+    "solve/posterior/local/*.py",
     "bus_load/stuffing.py",
     "host/code_runs.py",
 )

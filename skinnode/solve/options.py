@@ -18,6 +18,7 @@ from skinnode.model.tolerances import Tolerances
 from skinnode.solve.inputs import CodeMap
 
 TRACKER_METHODS: Final = ("auto", "exact", "posterior")
+PRIORS: Final = ("cells", "discs")
 DRIFTS: Final = ("none", "patch", "wire")
 
 
@@ -54,6 +55,10 @@ class EstimateOptions:
             noise.
         deadline_us: Time limit of an update, µs; an update can exceed it by the time of one solver step.
             Wires that are unsolved at the deadline have the status DEADLINE.
+        prior: Where the posterior expects loads once it has found a touch: ``cells`` for one variance per
+            cell, or ``discs`` for a few soft discs, which the evidence of the frame determines. With
+            ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
+            the loads are not local, ``discs`` uses ``cells``.
 
     Raises:
         ValueError: If an option is out of range.
@@ -73,10 +78,13 @@ class EstimateOptions:
     normal_only: bool = False
     hold: bool = True
     deadline_us: float | None = None
+    prior: str = "cells"
 
     def __post_init__(self) -> None:
         if self.drift not in DRIFTS:
             raise ValueError(f"drift: got {self.drift!r}, must be one of {', '.join(DRIFTS)}")
+        if self.prior not in PRIORS:
+            raise ValueError(f"prior: got {self.prior!r}, must be one of {', '.join(PRIORS)}")
         require_positive("drift_std", self.drift_std)
         if not (math.isfinite(self.model_error) and self.model_error >= 0):
             raise ValueError(f"model_error: got {self.model_error}, must be finite and at least 0")
@@ -194,6 +202,7 @@ class EstimateArguments(TypedDict, total=False):
     normal_only: bool
     hold: bool
     deadline_us: float | None
+    prior: str
 
 
 class PosteriorArguments(EstimateArguments, total=False):

@@ -17,7 +17,8 @@ import skinnode as sk
 from skinnode.solve.linalg.cholesky import cholesky
 from skinnode.solve.posterior import measurement_update as kernels
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
-from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE, MapEstimator
+from skinnode.solve.posterior.load_prior import PRIOR_DOUBT, SMOOTH_SHARE
+from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 from skinnode.solve.wires.problem import PatchProblem
 

@@ -19,7 +19,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.model.elastic import HertzContact, Rubber
-from skinnode.solve.posterior import map_estimate, posterior
+from skinnode.solve.posterior import load_prior, map_estimate, posterior
 
 from .press import frame_ohm, hertz_press
 
@@ -569,7 +569,7 @@ def test_covariance_belongs_to_the_field(small):
         std = np.sqrt(np.diag(covariance))
         ratio = (field.displacement_std_m.ravel() / std).reshape(5, -1)
         assert (ratio >= 1 - 1e-9).all()
-        assert (ratio <= np.sqrt(map_estimate.PRIOR_DOUBT)).all()
+        assert (ratio <= np.sqrt(load_prior.PRIOR_DOUBT)).all()
         assert (ratio[[0, 1, 3, 4]] <= loose).all()
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12 * covariance.max())
         assert np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > 0

@@ -44,6 +44,7 @@ _KERNELS: Final = (
     "model/kernels.py",
     "solve/*.py",
     "solve/*/*.py",
+    "solve/posterior/local/*.py",
     "bus_load/stuffing.py",
 )  # as in skinnode.compiled.jit
 _MEMORY_BYTES: Final = 8 << 30

@@ -8,7 +8,8 @@
 ``measurement_update``. ``geometry_error`` models manufacturing errors within the tolerances of a patch.
 
 The prior combines the elasticity of the rubber (``elastic_prior``, ``load_cells``) with the expected loads
-(``load_prior``). ``hyperparameters`` estimates the scale of the prior and the noise. ``load_posterior``
-estimates the loads of a frame, ``contact_regions`` divides them into contacts, and ``contacts`` measures each
-contact. ``data_share`` computes the fraction of a displacement that the data determine.
+(``load_prior``), which ``local`` expects in a few discs. ``hyperparameters`` estimates the scale of the
+prior and the noise. ``load_posterior`` estimates the loads of a frame, ``contact_regions`` divides them into
+contacts, and ``contacts`` measures each contact. ``data_share`` computes the fraction of a displacement that
+the data determine.
 """

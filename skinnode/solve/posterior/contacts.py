@@ -10,6 +10,7 @@ centre, area and shear of each contact, with standard deviations.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -24,7 +25,7 @@ from skinnode.solve.layer_force import bonded_force_n, layer_std_n
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.contact_regions import find_regions, region_scratch
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
-from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
+from skinnode.solve.posterior.load_prior import PRIOR_DOUBT
 
 HERTZ_SPREAD: Final = 2.5
 """Ratio of a² to the pressure-weighted mean of r² in a Hertz contact of radius a, where the pressure is
@@ -57,6 +58,8 @@ class LoadEstimate:
     """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float
     """Squared scale s² of the prior, pitch²."""
+    doubt: float = PRIOR_DOUBT
+    """Factor applied to the variances, because the loads depend mainly on the prior."""
 
 
 class ContactFinder:
@@ -147,7 +150,7 @@ class ContactFinder:
 
     def warm_up(self, loads: LoadEstimate) -> None:
         """Compile the kernels."""
-        pressed = LoadEstimate(-np.ones_like(loads.mean), loads.rows, loads.weight, loads.share, loads.scale2)
+        pressed = dataclasses.replace(loads, mean=-np.ones_like(loads.mean))
         self.find(pressed, -self._own_frame[:, 2].reshape(self._electrodes), np.ones(self._electrodes))
         self.reset()
 
@@ -156,7 +159,7 @@ class ContactFinder:
         prior, mean, std = self._prior, np.empty(7), np.empty(7)
         middle, pulls, pressing_n = _measure(
             number, self._number, self._outside, self._outermost, loads.mean, prior.load_n, prior.cell_m,
-            loads.rows, loads.weight, loads.share, loads.scale2, mean, std, *self._work,
+            loads.rows, loads.weight, loads.share, loads.scale2, loads.doubt, mean, std, *self._work,
         )  # fmt: skip
         force_n, force_std_n = float(mean[0]), float(std[0])
         # a load distributed uniformly over a square cell has a mean r² of cell_area / 6
@@ -231,6 +234,7 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     weight: Float,
     share: Float,
     scale2: float,
+    doubt: float,
     mean: Float,
     std: Float,
     cells: Index,
@@ -240,7 +244,7 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     """Compute the force in N, centre (3) in m, mean r² in m² and shear (2) in N of one contact.
 
     The seven values are written into ``mean``, and their standard deviations (by the delta method) into
-    ``std``. The variances are multiplied by ``PRIOR_DOUBT``, because the distribution of the load over the
+    ``std``. The variances are multiplied by ``doubt``, because the distribution of the load over the
     cells depends mainly on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work arrays.
 
     Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the pressing
@@ -323,7 +327,7 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     std[5] -= scale2 * load[0] * load[0] * s5
     std[6] -= scale2 * load[1] * load[1] * s6
     for f in range(7):
-        std[f] = PRIOR_DOUBT * scale2 * max(std[f], 0.0)
+        std[f] = doubt * scale2 * max(std[f], 0.0)
     b0, b1, b2, b3, b4, b5, b6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for cell in range(number.size):
         if outside[cell] == contact:

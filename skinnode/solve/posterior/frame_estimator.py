@@ -33,9 +33,10 @@ from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
 from skinnode.solve.posterior.data_share import data_share
-from skinnode.solve.posterior.elastic_prior import ElasticPrior
+from skinnode.solve.posterior.elastic_prior import LAYER_SHARE, ElasticPrior, bonded_response
 from skinnode.solve.posterior.gating import Fit, Gate
 from skinnode.solve.posterior.hyperparameters import Hyperparameters
+from skinnode.solve.posterior.local.disc_prior import DiscPrior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation, ObservationModel, Readings
 from skinnode.solve.wires.decode import A_MAX, A_MIN
@@ -114,7 +115,12 @@ class FrameEstimator:
         self._far = roots.FAR * float(self._problem.clearance.min())
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
-        self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
+        discs = None
+        if options.prior == "discs":
+            every = (np.arange(wires)[:, None] * layout.unknowns + self._free).ravel()
+            layer = np.ascontiguousarray(bonded_response(layout)[every] / LAYER_SHARE)
+            discs = DiscPrior(self._estimator, elastic.shape, height, layer)
+        self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise, discs)
         self.noise_estimate: NoiseEstimate | None = None
         self._forget()
         self.from_rest_s = 0.0
@@ -436,8 +442,7 @@ class FrameEstimator:
     def _data_share(self) -> Float:
         """Return the data share (U, 3N) of each coordinate; 0 for coordinates that are not free."""
         prior, share = self._estimator.load_prior, np.zeros_like(self._trusted)
-        variance = prior.scale2 * prior.covariance.diagonal()
-        share[:, self._free] = data_share(self._estimator.std, self._estimator.core, variance)
+        share[:, self._free] = data_share(self._estimator.std, self._estimator.core, prior)
         return share
 
     def _field(
@@ -446,7 +451,7 @@ class FrameEstimator:
         estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
-        std[:, self._free], core[:, self._free] = estimator.std, estimator.core
+        std[:, self._free], core[:, self._free] = self._hyper.with_spread(estimator.std, estimator.core)
         if held.all():  # allow for displacements too small for the gate to detect
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)

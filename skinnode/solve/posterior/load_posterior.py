@@ -45,7 +45,8 @@ class LoadPosterior:
     def estimate(self) -> LoadEstimate:
         """Return the loads and their covariance. The arrays are valid until the next frame."""
         rows, prior = self._whiten(), self._prior
-        return LoadEstimate(self.mean(), rows, self._ones[: len(rows)], prior.share, prior.scale2)
+        ones = self._ones[: len(rows)]
+        return LoadEstimate(self.mean(), rows, ones, prior.share, prior.scale2, prior.doubt)
 
     def mean(self) -> Float:
         """Return the mean loads (Q, 3) for the current displacement, in units of the prior's loads."""

@@ -20,7 +20,15 @@ from skinnode.model.layout import Float
 from skinnode.model.tolerances import EXACT, Tolerances
 from skinnode.process.clock import perf_counter
 from skinnode.solve import roots
-from skinnode.solve.linalg.cholesky import cholesky, inverse_diagonal, multiply, solve_lower
+from skinnode.solve.linalg.cholesky import (
+    cholesky,
+    inverse_diagonal,
+    multiply,
+    multiply_vector,
+    solve_lower,
+    solve_lower_transposed_vector,
+    solve_lower_vector,
+)
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior import geometry_error
 from skinnode.solve.posterior import measurement_update as kernels
@@ -60,14 +68,6 @@ EFFECT_STEP: Final = 0.2
 recomputed. Below this limit, the standard deviations change by less than 20 %."""
 HALVINGS: Final = 6
 """Maximum number of times that a Gauss-Newton step is halved."""
-PRIOR_DOUBT: Final = 3.0
-"""Factor applied to the part of the variance that depends on the prior; allows for the uncertainty of the
-expected loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement
-errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
-SMOOTH_SHARE: Final = 0.25
-"""Factor applied to the part of the variance that depends on the prior, for the 95 % interval. The factor is
-less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
-displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 
 
 class MapEstimator:
@@ -276,6 +276,46 @@ class MapEstimator:
 
     # -- evidence --------------------------------------------------------------------------------------
 
+    def linearise(self, observation: Observation, members: Index) -> None:
+        """Linearise the equations of the wires ``members`` (P,) at the current displacement."""
+        self.forget_factors()
+        self.members = members
+        self._linearise(observation, self.moved, members)
+
+    def factorise_uniform(self, observation: Observation, scale2: float) -> float:
+        """Factorise S for equal loads over the whole patch with s² = ``scale2``; return the log evidence.
+
+        The evidence is that of the last :meth:`linearise`, ln N(y; 0, S) without the constant term. The
+        factors remain until the next step of a solve.
+        """
+        b, m = self._b, self.factored_rows
+        self._assemble(observation, self.members, scale2, self.moved, self.load_prior.uniform)
+        self.factorisations += 1
+        self.factors += 1
+        if not cholesky(b.innovation_covariance, m):
+            return -math.inf
+        b.v[:m] = b.y[:m]
+        solve_lower_vector(b.innovation_covariance, b.v, m)
+        diagonal = b.innovation_covariance.diagonal()[:m]
+        return float(-0.5 * (b.v[:m] @ b.v[:m]) - np.log(diagonal).sum())
+
+    def whitened_data(self) -> Float:
+        """Return L⁻¹ y (m,) of the last :meth:`factorise_uniform`."""
+        return self._b.v[: self.factored_rows].copy()
+
+    def match(self, data: Float, response_t: Float) -> Float:
+        """Return (L⁻¹ J G)ᵀ z (C,) for whitened data z (m,) and Gᵀ (C, U f), using the current factors."""
+        b, f, rows = self._b, self._free.size, self._rows
+        z = data.copy()
+        solve_lower_transposed_vector(b.innovation_covariance, z, z.size)
+        gradient = np.zeros(len(self.load_prior.response))
+        for i, u in enumerate(self.members.tolist()):
+            block = slice(i * rows, (i + 1) * rows)
+            gradient[u * f : (u + 1) * f] = z[block] @ b.jacobian[block]
+        out = np.empty(len(response_t))
+        multiply_vector(response_t, gradient, out)
+        return out
+
     def signal(self) -> Float:
         """Return the prior variance (U, K) of each relative change in R at rest, for s = 1, in pitch⁻²."""
         wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
@@ -362,9 +402,17 @@ class MapEstimator:
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
         b.effect[:] = 0.0  # geometry errors have no effect at rest
 
-    def _assemble(self, observation: Observation, members: Index, scale2: float, moved: Float) -> float:
+    def _assemble(
+        self,
+        observation: Observation,
+        members: Index,
+        scale2: float,
+        moved: Float,
+        covariance: Float | None = None,
+    ) -> float:
         self._b = b = kernels.with_factors(self._b)
-        covariance, o = self.load_prior.covariance, observation
+        covariance = self.load_prior.covariance if covariance is None else covariance
+        o = observation
         trace = kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, b)
         if self._geometry is not None:
             b.factored_effect[:] = b.effect
@@ -430,7 +478,7 @@ class MapEstimator:
             out = self.noise_variance
             geometry_error.add_variance(self.members, b.factored_effect, kalman_gain_t, self._scratch, out)
         kernels.standard_deviations(
-            m, prior.covariance, prior.scale2, self.noise_variance, PRIOR_DOUBT, SMOOTH_SHARE, self.std,
+            m, prior.covariance, prior.scale2, self.noise_variance, prior.doubt, prior.smooth_share, self.std,
             self.core, b,
         )  # fmt: skip
         self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))

@@ -1,0 +1,242 @@
+"""Soft discs of loads: variance, evidence and search.
+
+A cell has four loads: two shear loads and a normal load on a half-space, and a normal load on a thin bonded
+layer. The last one moves the skin only near the cell, and stands for all displacements that no load on a
+half-space can cause. A disc d has a centre (row, column) and a radius R in cells, an amplitude a in units of
+the prior's loads, and a layer share β. It adds the variance a² w to the half-space loads of each cell, and
+a² β² w to the layer load, where
+
+    w = 1 / (1 + exp((r − R − ¼) / ¼)),   r: distance of the cell from the centre
+
+The loads of all discs together have the variances v. Let b = BᵀL⁻¹y and M = BᵀB, where B = L⁻¹ J G are the
+whitened effects of the loads on the data y, and L Lᵀ is the covariance of the data of an untouched skin. By
+the Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an
+untouched skin by
+
+    ½ |Λ⁻¹ V b|² − ln |Λ|,   Λ Λᵀ = I + V M V,   V = diag(√v)
+
+No eigenvalue of I + V M V is less than 1, so the factorisation is as accurate as that of the innovation
+covariance (:mod:`skinnode.solve.posterior.measurement_update`). Its size is four times the number of loaded
+cells, whatever the size of the patch.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.cholesky import cholesky, solve_lower_transposed_vector, solve_lower_vector
+from skinnode.solve.linalg.vectors import Index
+
+SOFT: Final = 0.25
+"""Width of the rim of a disc, cells."""
+FAINT: Final = 0.03
+"""Variance of a cell, relative to the largest, below which its loads are neglected in the evidence."""
+RADIUS: Final = 1.5
+"""Expected radius of a disc, cells."""
+RADIUS_SPREAD: Final = 0.7
+"""Standard deviation of ln(R + ¼) in the prior of a disc."""
+RADIUS_RANGE: Final = (0.3, 4.0)
+"""Minimum and maximum radius of a disc, cells."""
+AMPLITUDE_SPREAD: Final = 1.0
+"""Standard deviation of ln a in the prior of a disc."""
+LAYER: Final = 0.5
+"""Expected layer share β."""
+LAYER_SPREAD: Final = 1.5
+"""Standard deviation of ln β in the prior of a disc."""
+STEPS: Final = (0.5, 0.5, 0.3, 0.5, 1.0)
+"""First steps of the search in the row, column, ln R, ln a and ln β of a disc."""
+SWEEPS: Final = 3
+"""Maximum number of sweeps over all parameters. After a sweep without an improvement, the steps are
+halved."""
+WORTH: Final = 0.05
+"""Minimum gain in log-likelihood for a step to be taken."""
+PARAMETERS: Final = 5
+"""Number of parameters of a disc: row, column, ln R, ln a, ln β."""
+LOADS: Final = 4
+"""Number of loads of a cell: shear along and across the wire, normal load, normal load on a layer."""
+
+
+class Effects(NamedTuple):
+    """Effects of the loads of n cells on the data of one frame."""
+
+    place: Float
+    """(n, 2) row and column of each cell."""
+    gram: Float
+    """(4n, 4n) matrix M."""
+    match: Float
+    """(4n,) vector b."""
+
+
+class Scratch(NamedTuple):
+    """Work arrays for up to n cells."""
+
+    root: Float
+    """(2, n) standard deviations of the half-space loads and of the layer load of each cell."""
+    cells: Index
+    """(n,) cells with loads."""
+    factor: Float
+    """(4n, 4n) I + V M V, overwritten by Λ."""
+    vector: Float
+    """(4n,) V b, overwritten by Λ⁻¹ V b."""
+
+
+def make_scratch(cells: int) -> Scratch:
+    """Return work arrays for up to ``cells`` cells."""
+    loads = LOADS * cells
+    return Scratch(np.zeros((2, cells)), np.zeros(cells, np.int64), np.zeros((loads, loads)), np.zeros(loads))
+
+
+@njit
+def add_variance(discs: Float, place: Float, variance: Float) -> None:
+    """Write the variances of the half-space and layer loads (2, n) at the cells ``place`` (n, 2)."""
+    for cell in range(place.shape[0]):
+        total, layer = 0.0, 0.0
+        for d in range(discs.shape[0]):
+            row, column = place[cell, 0] - discs[d, 0], place[cell, 1] - discs[d, 1]
+            beyond = (math.sqrt(row * row + column * column) - math.exp(discs[d, 2]) - SOFT) / SOFT
+            if beyond < 40.0:
+                own = math.exp(2.0 * discs[d, 3]) / (1.0 + math.exp(max(beyond, -40.0)))
+                total += own
+                layer += own * math.exp(2.0 * discs[d, 4])
+        variance[0, cell] = total
+        variance[1, cell] = layer
+
+
+@njit_part
+def _factorise(discs: Float, effects: Effects, s: Scratch) -> int:
+    """Factorise I + V M V and solve for Λ⁻¹ V b; return the number of loaded cells, or −1 on failure."""
+    n = effects.place.shape[0]
+    add_variance(discs, effects.place, s.root)
+    most = 0.0
+    for cell in range(n):
+        most = max(most, s.root[0, cell])
+    count = 0
+    for cell in range(n):
+        if s.root[0, cell] > FAINT * most:
+            s.cells[count] = cell
+            count += 1
+        s.root[0, cell], s.root[1, cell] = (
+            math.sqrt(s.root[0, cell]),
+            math.sqrt(s.root[1, cell]),
+        )
+    for i in range(count):
+        at = LOADS * s.cells[i]
+        for t in range(LOADS):
+            root = s.root[t // 3, s.cells[i]]
+            row, source = s.factor[LOADS * i + t], effects.gram[at + t]
+            s.vector[LOADS * i + t] = root * effects.match[at + t]
+            for j in range(i, count):
+                cell = s.cells[j]
+                other, layer = root * s.root[0, cell], root * s.root[1, cell]
+                to, start = LOADS * j, LOADS * cell
+                row[to] = other * source[start]
+                row[to + 1] = other * source[start + 1]
+                row[to + 2] = other * source[start + 2]
+                row[to + 3] = layer * source[start + 3]
+            row[LOADS * i + t] += 1.0
+    if not cholesky(s.factor, LOADS * count):
+        return -1
+    solve_lower_vector(s.factor, s.vector, LOADS * count)
+    return count
+
+
+@njit
+def evidence(discs: Float, effects: Effects, s: Scratch) -> float:
+    """Return the log-likelihood of the data, relative to that of an untouched skin; −inf on failure.
+
+    Args:
+        discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
+        effects: Effects of the loads on the data.
+        s: Work arrays.
+    """
+    count = _factorise(discs, effects, s)
+    if count < 0:
+        return -math.inf
+    total = 0.0
+    for i in range(LOADS * count):
+        total += 0.5 * s.vector[i] * s.vector[i] - math.log(s.factor[i, i])
+    return total
+
+
+@njit
+def mean_loads(discs: Float, effects: Effects, s: Scratch, q: Float) -> float:
+    """Write the mean loads (4n,) under the discs into ``q``; return the evidence."""
+    for i in range(q.size):
+        q[i] = 0.0
+    count = _factorise(discs, effects, s)
+    if count < 0:
+        return -math.inf
+    total = 0.0
+    for i in range(LOADS * count):
+        total += 0.5 * s.vector[i] * s.vector[i] - math.log(s.factor[i, i])
+    solve_lower_transposed_vector(s.factor, s.vector, LOADS * count)
+    for i in range(count):
+        for t in range(LOADS):
+            q[LOADS * s.cells[i] + t] = s.root[t // 3, s.cells[i]] * s.vector[LOADS * i + t]
+    return total
+
+
+@njit
+def log_prior(discs: Float, amplitude: float) -> float:
+    """Return the log prior density of ``discs`` (D, 5) for an expected ln a ``amplitude``."""
+    total = 0.0
+    for d in range(discs.shape[0]):
+        wide = (math.log(math.exp(discs[d, 2]) + SOFT) - math.log(RADIUS)) / RADIUS_SPREAD
+        high = (discs[d, 3] - amplitude) / AMPLITUDE_SPREAD
+        layer = (discs[d, 4] - math.log(LAYER)) / LAYER_SPREAD
+        total -= 0.5 * (wide * wide + high * high + layer * layer)
+    return total
+
+
+@njit_part
+def _allowed(value: float, parameter: int, bounds: Float) -> float:
+    low: float = bounds[0, parameter]
+    high: float = bounds[1, parameter]
+    return min(max(value, low), high)
+
+
+@njit
+def climb(  # noqa: PLR0913 - a kernel: arrays by name
+    discs: Float, first: int, effects: Effects, amplitude: float, bounds: Float, trial: Float, s: Scratch
+) -> float:
+    """Improve the discs (D, 5) in place by a coordinate search; return their evidence plus log prior.
+
+    Args:
+        discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
+        first: Index of the first disc to improve; those before it stay as they are.
+        effects: Effects of the loads on the data.
+        amplitude: Expected ln a.
+        bounds: (2, 5) minimum and maximum of each parameter.
+        trial: (D, 5) copy of the discs, overwritten.
+        s: Work arrays.
+    """
+    best = evidence(trial, effects, s) + log_prior(trial, amplitude)
+    scale = 1.0
+    for _ in range(SWEEPS):
+        better = False
+        for d in range(first, discs.shape[0]):
+            for p in range(PARAMETERS):
+                taken = False
+                for sign in range(2):
+                    if sign == 1 and taken:
+                        break
+                    step = scale * STEPS[p] * (1.0 - 2.0 * sign)
+                    for _ in range(4):
+                        trial[d, p] = _allowed(discs[d, p] + step, p, bounds)
+                        if trial[d, p] == discs[d, p]:
+                            break
+                        found = evidence(trial, effects, s) + log_prior(trial, amplitude)
+                        if not found > best + WORTH:
+                            trial[d, p] = discs[d, p]
+                            break
+                        best = found
+                        discs[d, p] = trial[d, p]
+                        taken = better = True
+        if not better:
+            scale *= 0.5
+    return best

@@ -278,7 +278,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
     if facts["solved"] and isinstance(deepest_m, float):
         std = f" ± {std_m * 1e6:.1f}" if isinstance(std_m, float) else ""
         deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
-        deepest = f"  touched{deepest}" if facts["touched"] else deepest
+        deepest = f"  touched{deepest}" if facts.get("touched") else deepest
     worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
     trust = f"  untrusted: {facts['distrust']}" if facts["trusted"] is False else _doubts(facts)
     if facts["noise_factor"] not in (None, 1.0):

@@ -238,10 +238,16 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
         _print_row(f"{each['prior']} {each['family']}, {each['scenes']} scenes", each, echo)
 
 
+_COLUMNS: Final = (
+    ("error", 8, ".1%"), ("ratio", 11, ".2f"), ("ratio_moved", 7, ".2f"), ("ratio_rest", 6, ".2f"),
+    ("coverage", 9, ".1%"), ("coverage_moved", 7, ".1%"), ("coverage_rest", 7, ".1%"), ("wrong", 9, ".1%"),
+    ("contacts_right", 9, ".0%"), ("force_ratio", 7, ".2f"), ("centroid_ratio", 7, ".2f"), ("ms", 6, ".1f"),
+)  # fmt: skip
+
+
 def _print_row(where: str, each: dict[str, Any], echo: Callable[[str], object]) -> None:
-    echo(
-        f"  {where:44}{each['error']:8.1%}{each['ratio']:11.2f}{each['ratio_moved']:7.2f}"
-        f"{each['ratio_rest']:6.2f}"
-        f"{each['coverage']:9.1%}{each['coverage_moved']:7.1%}{each['coverage_rest']:7.1%}{each['wrong']:9.1%}"
-        f"{each['contacts_right']:9.0%}{each['force_ratio']:7.2f}{each['centroid_ratio']:7.2f}{each['ms']:6.1f}"
+    cells = (
+        ("-" if each[name] is None else format(each[name], form)).rjust(width)
+        for name, width, form in _COLUMNS
     )
+    echo(f"  {where:44}{''.join(cells)}")

@@ -70,6 +70,7 @@ class NodeRunner:
         # Number of frames that the port had sent when bus-off began. Any further frame proves recovery.
         self._sent_before = 0
         self._powered, self._stopping = clock.event(), clock.event()
+        self._stopped = False
         self._error: BaseException | None = None
         self._thread = clock.thread(target=self._run, name=f"nodes {port.config.name}")
 
@@ -86,14 +87,19 @@ class NodeRunner:
         self._thread.start()
         self._powered.wait()
 
+    def request_stop(self) -> None:
+        """Let the thread end within 0.1 s, without waiting for it. Call :meth:`stop` afterwards."""
+        self._stopping.set()
+
     def stop(self) -> None:
         """Power the nodes off and end the thread. Repeated calls have no effect.
 
         Raises:
             BaseException: the error that has ended the thread, if any.
         """
-        if self._stopping.is_set():
+        if self._stopped:
             return
+        self._stopped = True
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join()

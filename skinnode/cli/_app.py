@@ -25,6 +25,7 @@ from skinnode.cli import (
     replay,
     scan,
     tare,
+    view,
 )
 from skinnode.cli._help import App
 
@@ -47,6 +48,7 @@ app.command(name="nmt")(nmt.nmt)
 app.command(name="tare")(tare.tare)
 app.add_typer(lss.app, name="lss")
 app.command(name="monitor")(monitor.monitor)
+app.command(name="view")(view.view)
 app.command(name="doctor")(doctor.doctor)
 app.command(name="record")(record.record)
 app.command(name="replay")(replay.replay)

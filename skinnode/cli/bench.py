@@ -187,8 +187,8 @@ def accuracy(
     only: Annotated[
         Literal["detection", "families"] | None,
         typer.Option(
-            help="Run only this part: the touch detector, or families of loads that no prior expects, with each "
-            "prior. For families, --scenes counts the scenes of a family for each layout and noise."
+            help="Run only this part: the touch detector, or both priors on families of loads that neither "
+            "expects. For families, --scenes counts the scenes of a family for each layout and noise."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,

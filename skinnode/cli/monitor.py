@@ -12,6 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._options import OtherChannel, OtherInterface
+from skinnode.cli._watched_hand import (
+    Replayed,
+    Simulate,
+    Speed,
+    WatchedHand,
+    plan_of,
+    recording,
+    require_one_source,
+    require_used,
+    running,
+)
 
 if TYPE_CHECKING:
     import threading
@@ -19,30 +30,14 @@ if TYPE_CHECKING:
     from skinnode.config import HandConfig
     from skinnode.monitor.source import Source
 
-_SIMULATED = 4
-"""Number of patches to simulate if no hand file is given."""
-
 
 def monitor(
-    hand: Annotated[
-        Path | None, typer.Argument(help="Hand file to run and show.", metavar="[HAND.toml]")
-    ] = None,
+    hand: WatchedHand = None,
     interface: OtherInterface = None,
     channel: OtherChannel = None,
-    replay: Annotated[
-        Path | None,
-        typer.Option(help="Show a recording made by `skinnode record`.", metavar="RECORDING"),
-    ] = None,
-    speed: Annotated[
-        float | None, typer.Option(help="Speed of --replay: 2 is twice as fast; default 1.", metavar="X")
-    ] = None,
-    simulate: Annotated[
-        bool,
-        typer.Option(
-            "--simulate",
-            help="Simulate pressed patches on a private bus: the hand's patches, or four without a hand.",
-        ),
-    ] = False,
+    replay: Replayed = None,
+    speed: Speed = None,
+    simulate: Simulate = False,
     output: Annotated[
         str,  # Path would turn an empty string into the current folder
         typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
@@ -65,14 +60,12 @@ def monitor(
     if no fault occurred, 1 if any fault occurred (faults are printed at the end), 2 if the monitor could not
     run.
     """
-    from skinnode.errors import NOTHING, ConfigError, Shown
+    from skinnode.errors import ConfigError
 
     if not as_json:
         _require_screen()
-    if (hand is not None or simulate) == (replay is not None):
-        got = NOTHING if replay is None else Shown("both it and --replay")
-        raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
-    _require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
+    require_one_source(hand, replay, simulate=simulate)
+    require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise ConfigError("--output", output, "a folder name; the first recording creates the folder")
     from skinnode.host import BringUpCancelled
@@ -81,9 +74,9 @@ def monitor(
     with stop_on_signal() as stop, ExitStack() as stack:
         try:
             if replay is not None:
-                source = _recording(stack, replay, 1.0 if speed is None else speed)
+                source = recording(stack, replay, 1.0 if speed is None else speed)
             else:
-                source = _running(stack, _plan(hand, interface, channel, simulate), stop, simulate, as_json)
+                source = _running(stack, plan_of(hand, interface, channel, simulate), stop, simulate, as_json)
         except BringUpCancelled:
             return
         faults = _print(source, stop, seconds) if as_json else _show(source, stop, seconds, Path(output))
@@ -92,20 +85,6 @@ def monitor(
         print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
     if faults:
         raise typer.Exit(1)
-
-
-def _require_used(
-    interface: str | None, channel: str | None, speed: float | None, *, played: bool, simulated: bool
-) -> None:
-    """Raise ConfigError for an option without effect on a recording or a simulated hand."""
-    from skinnode.errors import ConfigError
-
-    if speed is not None and not played:
-        raise ConfigError("--speed", speed, "only with --replay")
-    for option, value in (("--interface", interface), ("--channel", channel)):
-        if value is not None and (played or simulated):
-            allowed = f"only without {'--replay' if played else '--simulate'}, which opens no bus of a hand"
-            raise ConfigError(option, value, allowed)
 
 
 def _require_screen() -> None:
@@ -121,65 +100,17 @@ def _require_screen() -> None:
         raise ConfigError("standard input and output", Shown("no terminal"), "a terminal, or --json")
 
 
-def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """Return the hand to run, with settings that make the host wait for missing patches."""
-    from skinnode.config import load_hand
-    from skinnode.demo.hand import demo_hand
-
-    if hand is not None:
-        plan = load_hand(hand).on(interface, channel)
-    else:
-        plan = demo_hand(_SIMULATED, seed=1)
-        # only the method "posterior" computes contact forces
-        solver = plan.solver.model_copy(update={"method": "posterior"})
-        plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
-    if simulate:
-        from skinnode.demo.simulated import on_simulated_buses
-
-        plan = on_simulated_buses(plan)
-    waiting = plan.bring_up.model_copy(update={"missing": "wait"})
-    return plan.model_copy(update={"bring_up": waiting})
-
-
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a monitor source that runs a host; closing ``stack`` also closes the source.
-
-    Raises the same errors as :meth:`Host.from_config`.
-    """
+    """Return a source that runs a host, after the slow import of the screen."""
     from skinnode.cli._console import progress
-    from skinnode.compiled.jit import is_cold
-    from skinnode.host import Host
-    from skinnode.host.scan_solver import check_solvable
-    from skinnode.monitor.source import HostSource
-    from skinnode.process.garbage_collection import responsive_threads, without_long_collections
-    from skinnode.text.words import counted
 
     if not quiet:
         import skinnode.monitor.app  # noqa: F401  # slow, so import it before deadlines apply
 
     with progress(quiet) as tell:
-        tell("compiling the kernels once" if is_cold() else "preparing the solvers")
-        for patch in plan.patches:
-            check_solvable(patch, plan.solver)
-        if simulate:
-            from skinnode.demo.simulated import simulated
-
-            stack.enter_context(simulated(plan))
-        tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
-        stack.enter_context(responsive_threads())
-        stack.enter_context(without_long_collections())  # collects garbage now, before the first SYNC
-        host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
-    return stack.enter_context(HostSource(host))
-
-
-def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """Return a monitor source that plays a recording; closing ``stack`` also closes the source."""
-    from skinnode.monitor.source import ReplaySource
-    from skinnode.record import replay
-
-    return stack.enter_context(ReplaySource(replay(path, speed=speed)))
+        return running(stack, plan, stop, simulate=simulate, tell=tell)
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:

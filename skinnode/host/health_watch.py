@@ -45,6 +45,10 @@ _BUS_COUNTERS: Final = {
 """Counters of :class:`BusHealth`, with the singular and any irregular plural for event texts."""
 
 
+def _monotonic_ns() -> int:
+    return clock.monotonic_ns()
+
+
 def _is_frozen_part(fault: DataFault) -> bool:
     return fault.kind is FaultKind.FROZEN and fault.part is not FaultyPart.PATCH
 
@@ -52,10 +56,20 @@ def _is_frozen_part(fault: DataFault) -> bool:
 class HealthWatch:
     """Publisher of the changes in the health of all patches and buses, and of onsets and releases.
 
-    Threads: a dedicated thread checks the health, from construction until :meth:`close`.
+    Threads: a dedicated thread checks the health, from :meth:`__enter__` until :meth:`close`. Without that
+    thread, the caller calls :meth:`check`.
+
+    Args:
+        patches: Function that returns the health of each patch.
+        buses: Function that returns the health of each bus.
+        events: Where changes are published.
+        defects: Where exceptions are reported.
+        all_defects: Function that returns the statistics of all contained exceptions.
+        touches: Function that returns the onsets and releases since its last call.
+        now_ns: Function that returns the time of the checks, ns.
     """
 
-    def __init__(  # noqa: PLR0913 - what is watched
+    def __init__(  # noqa: PLR0913 - what is watched, and by which clock
         self,
         patches: Callable[[], Mapping[str, PatchHealth]],
         buses: Callable[[], Mapping[str, BusHealth]],
@@ -63,17 +77,17 @@ class HealthWatch:
         defects: Defects | None = None,
         all_defects: Callable[[], Mapping[str, DefectStats]] = dict,
         touches: Callable[[], list[TouchChange]] = list,
+        now_ns: Callable[[], int] = _monotonic_ns,
     ) -> None:
         self._patches, self._buses, self._events = patches, buses, events
         self._defects = Defects("host") if defects is None else defects
-        self._all_defects, self._touches = all_defects, touches
+        self._all_defects, self._touches, self._now_ns = all_defects, touches, now_ns
         self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
         # (subject, counter) -> time and counter value of the last event
         self._reported: dict[tuple[str, str], tuple[int, int]] = {}
         self._stop = clock.event()
         self._thread = clock.thread(target=self._run, name="health")
-        self._thread.start()
 
     def close(self) -> None:
         """Check the health once more, then end and join the thread."""
@@ -81,6 +95,7 @@ class HealthWatch:
         self._thread.join()
 
     def __enter__(self) -> Self:
+        self._thread.start()
         return self
 
     def __exit__(
@@ -99,12 +114,16 @@ class HealthWatch:
         if self._ended:
             return False
         self._ended = self._stop.wait(_CHECK_S)
+        self.check()
+        return True
+
+    def check(self) -> None:
+        """Publish the changes since the last check. Never raises."""
         for check in (self._check_touches, self._check_patches, self._check_buses, self._check_defects):
             try:
                 check()
             except Exception as error:
                 self._defects.report("watching the health", error)
-        return True
 
     def _check_touches(self) -> None:
         for change in self._touches():
@@ -178,10 +197,10 @@ class HealthWatch:
     ) -> None:
         before, count = counts
         when_ns, reported = self._reported.get((name, counter), (0, before))
-        t_ns = clock.monotonic_ns()
+        t_ns = self._now_ns()
         if count > reported and t_ns - when_ns > _QUIET_NS:
             self._reported[name, counter] = t_ns, count
             self._publish(name, counter, f"{counted(count - reported, *words)}{detail}")
 
     def _publish(self, subject: str, what: str, text: str) -> None:
-        self._events.publish(HealthEvent(clock.monotonic_ns(), subject, what, text))
+        self._events.publish(HealthEvent(self._now_ns(), subject, what, text))

@@ -113,7 +113,7 @@ class MonitorApp(App[None]):
         """Message about each completed tare, and its severity."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
-        self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
+        self._wall_minus_mono_ns = source.wall_minus_mono_ns
         self._records = _Records(self._lines)
 
     def compose(self) -> ComposeResult:

@@ -30,8 +30,13 @@ Colours = Literal["rgb", "ansi", "none"]
 Line = list[Segment]
 """Styled text of a screen line or of part of one."""
 
-# Five points of matplotlib's colour map "magma" (CC0). Its perceived brightness increases uniformly.
-_MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
+MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
+"""Five equidistant points of matplotlib's colour map "magma" (CC0), (5, 3) RGB from 0 to 255.
+
+The perceived brightness of the colour map increases uniformly.
+"""
+UNKNOWN_RGB: Final = (74, 78, 88)
+"""Colour where the depth is unknown."""
 LEVELS: Final = 24
 """Number of shades. More shades would look the same but take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
@@ -310,8 +315,8 @@ _ARROW: Final = Color.from_rgb(140, 245, 225)
 @functools.lru_cache(maxsize=LEVELS + 1)
 def _rgb(level: int) -> Color:
     if level == _UNKNOWN:
-        return Color.from_rgb(74, 78, 88)
-    position = level / (LEVELS - 1) * (len(_MAGMA) - 1)
-    low = min(int(position), len(_MAGMA) - 2)
-    red, green, blue = _MAGMA[low] + (position - low) * (_MAGMA[low + 1] - _MAGMA[low])
+        return Color.from_rgb(*UNKNOWN_RGB)
+    position = level / (LEVELS - 1) * (len(MAGMA) - 1)
+    low = min(int(position), len(MAGMA) - 2)
+    red, green, blue = MAGMA[low] + (position - low) * (MAGMA[low + 1] - MAGMA[low])
     return Color.from_rgb(float(red), float(green), float(blue))

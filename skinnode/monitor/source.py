@@ -6,7 +6,6 @@ Sources take only the newest data and never block the host.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,13 +15,14 @@ from typing import Final, Protocol, Self
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
-from skinnode.host import Host, PatchHealth
+from skinnode.host import Host, PatchHealth, Subscription
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
@@ -70,6 +70,16 @@ class Source(Protocol):
     def events(self) -> list[HealthEvent]:
         """Return the events since the last call."""
 
+    def fields(self, capacity: int) -> Subscription:
+        """Subscribe to the fields of all patches; a full queue of ``capacity`` fields drops its oldest."""
+
+    def now_ns(self) -> int:
+        """Return the current time on the monotonic clock of the times in snapshots, ns."""
+
+    @property
+    def wall_minus_mono_ns(self) -> int:
+        """Difference between the wall clock and the monotonic clock of the times in snapshots, ns."""
+
     @property
     def over(self) -> bool:
         """Whether the source has ended."""
@@ -114,7 +124,7 @@ class HostSource:
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(
-            t_ns=time.monotonic_ns(),
+            t_ns=clock.monotonic_ns(),
             health={name: host.health(name) for name in stats.patches},
             bus_health={name: host.bus_health(name) for name in stats.buses},
             buses=stats.buses,
@@ -125,6 +135,19 @@ class HostSource:
     def events(self) -> list[HealthEvent]:
         """Return the events since the last call."""
         return drain(self._events)
+
+    def fields(self, capacity: int) -> Subscription:
+        """Subscribe to the fields of all patches."""
+        return self._host.fields(capacity=capacity)
+
+    def now_ns(self) -> int:
+        """Return the current time, ns."""
+        return clock.monotonic_ns()
+
+    @property
+    def wall_minus_mono_ns(self) -> int:
+        """Difference between the wall clock and the monotonic clock, ns."""
+        return clock.time_ns() - clock.monotonic_ns()
 
     @property
     def over(self) -> bool:
@@ -194,7 +217,13 @@ class ReplaySource:
         self._all_events = events = Events()
         self._events: EventSubscription = events.subscribe(_EVENTS)
         self._running.enter_context(
-            HealthWatch(self._health, self._bus_health, events, touches=run.publisher.touches.take)
+            HealthWatch(
+                lambda: health_in(run),
+                lambda: bus_health_in(run),
+                events,
+                touches=run.publisher.touches.take,
+                now_ns=run.clock,
+            )
         )
         self._thread = threading.Thread(target=self._play, name="replay", daemon=True)
         self._thread.start()
@@ -203,18 +232,24 @@ class ReplaySource:
         """Return the current state of the hand."""
         if self._failure is not None:
             raise self._failure
-        return Snapshot(
-            t_ns=self._run.clock(),
-            health=self._health(),
-            bus_health=self._bus_health(),
-            buses=self._run.bus_stats(),
-            streams=self._run.patch_stats(),
-            fields={patch.name: self._run.publisher.latest(patch.name) for patch in self.hand.patches},
-        )
+        return snapshot_of(self._run)
 
     def events(self) -> list[HealthEvent]:
         """Return the events since the last call."""
         return drain(self._events)
+
+    def fields(self, capacity: int) -> Subscription:
+        """Subscribe to the fields of all patches."""
+        return self._run.publisher.subscribe(capacity, None, None)
+
+    def now_ns(self) -> int:
+        """Return the current replay time on the recording host's monotonic clock, ns."""
+        return self._run.clock()
+
+    @property
+    def wall_minus_mono_ns(self) -> int:
+        """Difference between the wall clock and the monotonic clock of the recording host, ns."""
+        return self._run.wall_minus_mono_ns
 
     @property
     def over(self) -> bool:
@@ -266,29 +301,49 @@ class ReplaySource:
         except Exception as error:  # also report unexpected exceptions to the user
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
-    def _health(self) -> dict[str, PatchHealth]:
-        return {patch.name: self._run.health(patch.name) for patch in self.hand.patches}
 
-    def _bus_health(self) -> dict[str, BusHealth]:
-        return {
-            name: BusHealth(
-                bus=name,
-                away=None,
-                load=stats.load,
-                error_frames=stats.error_frames,
-                bus_offs=stats.bus_offs,
-                outages=0,
-                kernel_dropped=0,
-                dropped=0,
-                malformed=stats.malformed,
-                foreign=stats.foreign,
-                foreign_ids=tuple(sorted(stats.foreign_ids)),
-                other_syncs=0,
-                other_masters=0,
-                controller=stats.controller,
-            )
-            for name, stats in self._run.bus_stats().items()
-        }
+def snapshot_of(run: Replay) -> Snapshot:
+    """Return the state of the hand at the current time of a replay.
+
+    Args:
+        run: The replay.
+    """
+    return Snapshot(
+        t_ns=run.clock(),
+        health=health_in(run),
+        bus_health=bus_health_in(run),
+        buses=run.bus_stats(),
+        streams=run.patch_stats(),
+        fields={patch.name: run.publisher.latest(patch.name) for patch in run.hand.patches},
+    )
+
+
+def health_in(run: Replay) -> dict[str, PatchHealth]:
+    """Return the health of each patch at the current time of a replay."""
+    return {patch.name: run.health(patch.name) for patch in run.hand.patches}
+
+
+def bus_health_in(run: Replay) -> dict[str, BusHealth]:
+    """Return the health of each bus at the current time of a replay."""
+    return {
+        name: BusHealth(
+            bus=name,
+            away=None,
+            load=stats.load,
+            error_frames=stats.error_frames,
+            bus_offs=stats.bus_offs,
+            outages=0,
+            kernel_dropped=0,
+            dropped=0,
+            malformed=stats.malformed,
+            foreign=stats.foreign,
+            foreign_ids=tuple(sorted(stats.foreign_ids)),
+            other_syncs=0,
+            other_masters=0,
+            controller=stats.controller,
+        )
+        for name, stats in run.bus_stats().items()
+    }
 
 
 def drain(subscription: EventSubscription) -> list[HealthEvent]:

@@ -152,7 +152,7 @@ def _rows(run: Replay) -> Iterator[FieldRow]:
     kept = run.resistances
     assert kept is not None
     for field in run:
-        yield row_of(field, kept.popleft(), run.offset_ns)
+        yield row_of(field, kept.popleft(), run.wall_minus_mono_ns)
 
 
 def _write_table(target: Path, hand: str, rows: Iterator[FieldRow]) -> int:
@@ -202,8 +202,8 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
 def _write_field(file: McapFile, run: Replay, field: FieldFrame) -> None:
     stamp = field.stamp
     assert stamp is not None
-    log_ns = stamp.t_receive_ns + run.offset_ns
-    file.write_field(field, run.layout(stamp.patch).upper_m, run.offset_ns, log_ns)
+    log_ns = stamp.t_receive_ns + run.wall_minus_mono_ns
+    file.write_field(field, run.layout(stamp.patch).upper_m, run.wall_minus_mono_ns, log_ns)
 
 
 class _Tee:

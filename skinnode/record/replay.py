@@ -240,7 +240,7 @@ class Replay:
         return config.layout.build() if solver is None else solver.facts.layout
 
     @property
-    def offset_ns(self) -> int:
+    def wall_minus_mono_ns(self) -> int:
         """Difference between the time since 1970 and the recording host's monotonic clock, ns."""
         return self._offset_ns
 

@@ -128,6 +128,7 @@ OPTIONS: dict[str, Callable[[str], list[str]]] = {
     "convert": lambda file: ["convert", file, "y.npz"],
     "convert --hand": lambda file: ["convert", "x.log", "y.npz", "--hand", file],
     "monitor --replay": lambda file: ["monitor", "--json", "--replay", file],
+    "view --replay": lambda file: ["view", "--web", "--replay", file],
     "info --eds": lambda file: ["info", "5", *BUS, "--eds", file],
     "od --diff": lambda file: ["od", "5", *BUS, "--diff", file],
     "conformance --eds": lambda file: ["conformance", "--node-id", "5", *BUS, "--eds", file],

@@ -146,6 +146,11 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
     "lss list": lambda place: [place.bus, ["--interface", WORSE]],
     "lss set": lambda place: [["--serial", WORSE], ["--hand", place.missing, "--yes"]],
     "monitor": lambda place: [[place.missing], [place.hand(), "--json", "--seconds", "0.3"]],
+    "view": lambda place: [
+        [place.missing, "--web"],
+        ["--replay", place.missing, "--web"],
+        ["--simulate", "--save", place.missing],
+    ],
     "doctor": lambda place: [
         [place.hand(), "--html", str(place.folder / "doctor.html")],
         [place.missing],

@@ -92,7 +92,7 @@ def test_with_the_baselines_it_gives_the_fields_of_the_host(
 ) -> None:
     hand = hand_file(tmp_path, recorded)
     ours = replay(recorded)
-    wanted = by_time(list(ours), ours.offset_ns)
+    wanted = by_time(list(ours), ours.wall_minus_mono_ns)
     run = replay(foreign(recorded, tmp_path, channel), hand=hand)
     found = by_time(list(run), 0)
     assert (run.flaws, run.notes, run.strange) == ([], (), 0)
@@ -119,7 +119,7 @@ def test_frames_of_another_bus_are_left_out(recorded: Path, tmp_path: Path) -> N
 
 def test_without_baselines_it_says_so_and_is_close(recorded: Path, tmp_path: Path) -> None:
     ours = replay(recorded)
-    wanted = by_time(list(ours), ours.offset_ns)
+    wanted = by_time(list(ours), ours.wall_minus_mono_ns)
     run = replay(foreign(recorded, tmp_path), hand=hand_file(tmp_path))
     found = by_time(list(run), 0)
     assert [note.partition(":")[0] for note in run.notes] == ["p0", "p1"]

@@ -199,7 +199,7 @@ def test_frames_of_every_kind_come_back_with_every_nanosecond(tmp_path: Path) ->
         recorder.received("can0", FRAMES)
         for frame in FRAMES:
             recorder.sent("can0", frame)
-    offset_ns = replay(path).offset_ns
+    offset_ns = replay(path).wall_minus_mono_ns
     back = [(g.frame._replace(t_ns=g.frame.t_ns - offset_ns), g.channel, g.sent) for g in McapReader(path)]
     assert back == [(f, "can0", sent) for sent in (False, True) for f in FRAMES]
     with AnyReader([path]) as bag:

@@ -1,0 +1,270 @@
+"""``skinnode view``: shows a hand in three dimensions, in a window, in a browser or in a file."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from skinnode.cli._options import OtherChannel, OtherInterface, Seconds
+from skinnode.cli._watched_hand import (
+    Replayed,
+    Simulate,
+    Speed,
+    WatchedHand,
+    plan_of,
+    require_one_source,
+    require_used,
+    running,
+)
+
+if TYPE_CHECKING:
+    import threading
+
+    from skinnode.config import HandConfig
+    from skinnode.errors import SkinError
+    from skinnode.monitor.source import Source
+    from skinnode.view.drawing_process import DrawingProcess
+    from skinnode.view.drawing_thread import DrawingThread
+    from skinnode.view.outputs import Output, OutputOptions
+    from skinnode.view.texts import DrawnCounts
+    from skinnode.view.viewer_process import ViewerProcess
+
+_LOOK_S = 0.1
+"""Interval between checks of the viewer, s."""
+_PORTS = 65_534
+
+
+class _Drawing(NamedTuple):
+    """Options of the drawing."""
+
+    output: OutputOptions
+    rate_hz: float
+    exaggeration: float
+    seconds: float | None
+
+
+def view(
+    hand: WatchedHand = None,
+    interface: OtherInterface = None,
+    channel: OtherChannel = None,
+    replay: Replayed = None,
+    speed: Speed = None,
+    simulate: Simulate = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Show the hand in a browser instead of a window.")
+    ] = False,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="Address on which --web listens; default 127.0.0.1, which only this machine reaches.",
+            metavar="IP",
+        ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=_PORTS, help="Port of --web; default 9090. The next port is used too.", metavar="PORT"
+        ),
+    ] = None,
+    save: Annotated[
+        str | None,
+        typer.Option(
+            help="Write a new file that `rerun FILE.rrd` shows; without a window.", metavar="FILE.rrd"
+        ),
+    ] = None,
+    rate: Annotated[
+        float,
+        typer.Option(min=0.1, max=1000.0, help="Maximum pictures of a patch per second.", metavar="HZ"),
+    ] = 30.0,
+    exaggerate: Annotated[
+        float,
+        typer.Option(min=0.0, max=1000.0, help="Draw displacements this many times enlarged.", metavar="X"),
+    ] = 10.0,
+    seconds: Seconds = None,
+) -> None:
+    """Show a hand in 3-D: pressed surfaces, shear, contacts with forces, health, events, curves over time.
+
+    The command runs the hand as `skinnode host` does, but waits for missing patches. Without --web and
+    --save, it opens a window and ends when the window is closed. With --replay and --save alone, it converts
+    the whole recording as fast as possible. Requires the optional packages of the extra `view`. The exit
+    status is 0 if no fault occurred, 1 if any fault occurred (faults are printed at the end), 2 if the
+    command could not run.
+    """
+    from skinnode.errors import ConfigError
+
+    _require_viewer()
+    require_one_source(hand, replay, simulate=simulate)
+    require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
+    for option, value in (("--address", address), ("--port", port)):
+        if value is not None and not web:
+            raise ConfigError(option, value, "only with --web")
+    from skinnode.view.outputs import PORT, SUFFIX, OutputOptions
+    from skinnode.view.viewer_process import LOCAL
+
+    if save is not None and not save.endswith(SUFFIX):  # Path would turn an empty string into a folder
+        raise ConfigError("--save", save, f"a file name that ends in {SUFFIX}")
+    options = OutputOptions(
+        window=not web and save is None,
+        web=web,
+        save=None if save is None else Path(save),
+        address=LOCAL if address is None else address,
+        port=PORT if port is None else port,
+    )
+    drawing = _Drawing(options, rate, exaggerate, seconds)
+    from skinnode.host import BringUpCancelled
+    from skinnode.process.signals import stop_on_signal
+
+    with stop_on_signal() as stop, ExitStack() as stack:
+        try:
+            if replay is not None and save is not None and speed is None and not web:
+                faults, counts = _convert(stack, replay, options, stop, exaggerate)
+            else:
+                if replay is not None:
+                    shown = _replaying(stack, replay, 1.0 if speed is None else speed, drawing)
+                else:
+                    plan = plan_of(hand, interface, channel, simulate)
+                    shown = _live(stack, plan, drawing, stop, simulate=simulate)
+                faults, counts = _show(*shown, stop, drawing)
+        except BringUpCancelled:
+            return
+    _report(faults, counts)
+
+
+def _require_viewer() -> None:
+    from skinnode.view.viewer_process import require_viewer
+
+    require_viewer()
+
+
+def _open(stack: ExitStack, options: OutputOptions) -> Output:
+    """Open the output before the hand, so that a port in use is reported at once."""
+    from skinnode.view.outputs import open_output
+
+    output = stack.enter_context(open_output(options))
+    if output.page_url is not None:
+        print(f"open {output.page_url} in a browser; Ctrl-C ends", flush=True)
+    return output
+
+
+def _live(
+    stack: ExitStack, plan: HandConfig, drawing: _Drawing, stop: threading.Event, *, simulate: bool
+) -> tuple[Output, DrawingProcess, Source]:
+    """Open the output and the drawing, then run the hand; return all three."""
+    import time
+
+    from skinnode.cli._console import progress
+
+    output = _open(stack, drawing.output)
+    process = _draw_on(stack, output, plan, plan.name, drawing, time.time_ns() - time.monotonic_ns())
+    with progress() as tell:
+        return output, process, running(stack, plan, stop, simulate=simulate, tell=tell)
+
+
+def _replaying(
+    stack: ExitStack, path: Path, speed: float, drawing: _Drawing
+) -> tuple[Output, DrawingProcess, Source]:
+    """Open a recording, the output and the drawing, then play the recording; return the last three."""
+    from skinnode.monitor.source import ReplaySource
+    from skinnode.record import replay
+
+    run = replay(path, speed=speed)
+    stack.callback(run.log.close)
+    output = _open(stack, drawing.output)
+    process = _draw_on(stack, output, run.hand, path.name, drawing, run.wall_minus_mono_ns)
+    return output, process, stack.enter_context(ReplaySource(run))
+
+
+def _draw_on(
+    stack: ExitStack, output: Output, hand: HandConfig, name: str, drawing: _Drawing, wall_minus_mono_ns: int
+) -> DrawingProcess:
+    from skinnode.view.drawing_process import DrawingOptions, DrawingProcess
+
+    options = DrawingOptions(drawing.exaggeration, wall_minus_mono_ns, live=True)
+    return stack.enter_context(DrawingProcess(hand, output.target(name), options))
+
+
+def _show(
+    output: Output,
+    process: DrawingProcess,
+    source: Source,
+    stop: threading.Event,
+    drawing: _Drawing,
+) -> tuple[list[str], DrawnCounts]:
+    """Draw a source until the user ends it; return the faults and the counts of the fields."""
+    from skinnode.view.drawing_thread import DrawingThread
+
+    with DrawingThread(source, process.draw, rate_hz=drawing.rate_hz) as thread:
+        _wait(source, output, thread, stop, drawing.seconds)
+    if thread.failure is not None:
+        if output.viewer is not None and output.viewer.ended:
+            raise _viewer_ended(output.viewer)
+        raise thread.failure
+    return [*thread.faults.lines, *source.flaws], thread.counts
+
+
+def _wait(
+    source: Source, output: Output, thread: DrawingThread, stop: threading.Event, seconds: float | None
+) -> None:
+    """Wait until the user, the time limit, the viewer or the end of the recording ends the drawing."""
+    import time
+
+    end_s = None if seconds is None else time.monotonic() + seconds
+    over = False
+    while not stop.wait(_LOOK_S) and thread.failure is None:
+        if end_s is not None and time.monotonic() >= end_s:
+            return
+        if source.over and output.viewer is None:
+            return
+        if source.over and not over:
+            over = True
+            print("end of the recording; Ctrl-C ends", flush=True)
+        if output.viewer is not None and output.viewer.ended:
+            if output.page_url is None and output.viewer.closed:  # by the user
+                return
+            raise _viewer_ended(output.viewer)
+
+
+def _viewer_ended(viewer: ViewerProcess) -> SkinError:
+    from skinnode.errors import SkinError
+
+    return SkinError(f"the viewer ended: {viewer.why()}")
+
+
+def _convert(
+    stack: ExitStack, path: Path, options: OutputOptions, stop: threading.Event, exaggeration: float
+) -> tuple[list[str], DrawnCounts]:
+    """Write a whole recording to a file; return its faults and the counts of the fields."""
+    from skinnode.view.conversion import Conversion
+    from skinnode.view.drawing import HandDrawing
+    from skinnode.view.outputs import require_new_file
+    from skinnode.view.stream import open_stream
+
+    if options.save is not None:
+        require_new_file(options.save)
+    conversion = Conversion(path, stop.is_set)
+    stack.callback(conversion.replay.log.close)
+    output = _open(stack, options)
+    drawing = HandDrawing(
+        stack.enter_context(open_stream(output.target(path.name))),
+        conversion.replay.hand,
+        exaggeration=exaggeration,
+        wall_minus_mono_ns=conversion.replay.wall_minus_mono_ns,
+        live=False,
+    )
+    conversion.run(drawing.draw)
+    return [*conversion.faults.lines, *conversion.replay.flaws], conversion.counts
+
+
+def _report(faults: list[str], counts: DrawnCounts) -> None:
+    print(
+        f"{counts.drawn} fields drawn, {counts.left_out} left out for newer ones, "
+        f"{counts.dropped} dropped because drawing was too slow"
+    )
+    for fault in faults:
+        print(f"fault: {fault}", file=sys.stdout)
+    if faults:
+        raise typer.Exit(1)

@@ -1,0 +1,111 @@
+"""Draws a recording completely and as fast as possible, for a file that is looked at later.
+
+Unlike :mod:`skinnode.view.drawing_thread`, nothing is left out: the recording waits for the drawing. All
+times, including those of events, are times of the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from skinnode.host.events import Events
+from skinnode.host.health_watch import HealthWatch
+from skinnode.model.frames import FieldFrame
+from skinnode.monitor.report import FaultBook
+from skinnode.monitor.source import bus_health_in, drain, health_in, snapshot_of
+from skinnode.monitor.view_model import History
+from skinnode.record import Replay, replay
+from skinnode.view.drawing_thread import RATE_HZ, STATE_S
+from skinnode.view.texts import DrawnCounts
+from skinnode.view.tick import Tick
+
+_CHECK_NS: Final = 50_000_000
+"""Interval of the recording between checks for changes of health, ns, as in a running host."""
+_EVENTS: Final = 1024
+
+Draw = Callable[[Tick], None]
+
+
+class Conversion:
+    """Conversion of a recording into a drawing; :meth:`run` carries it out.
+
+    Args:
+        path: Log of the recording.
+        cancelled: Function called before each frame; the conversion ends when it returns True.
+
+    Raises:
+        ConfigError: The recording cannot be read.
+    """
+
+    def __init__(self, path: Path, cancelled: Callable[[], bool] = lambda: False) -> None:
+        self._cancelled = cancelled
+        self.replay: Replay = replay(path, cancelled=self._before_frame)
+        """The replay; ``hand`` is the hand of the recording."""
+        self.faults = FaultBook(live=False)
+        self._history = History(self.replay.hand, live=False)
+        events = Events()
+        self._events = events.subscribe(_EVENTS)
+        self._watch = HealthWatch(
+            lambda: health_in(self.replay),
+            lambda: bus_health_in(self.replay),
+            events,
+            now_ns=self.replay.clock,
+        )
+        self._draw: Draw | None = None
+        self._pending: dict[str, FieldFrame] = {}
+        self._drawn = 0
+        self._fields_since_ns = self._fields_ns = self._checked_ns = self._state_ns = 0
+
+    @property
+    def counts(self) -> DrawnCounts:
+        """Counts of the fields so far."""
+        return DrawnCounts(self._drawn, 0, 0)
+
+    def run(self, draw: Draw) -> None:
+        """Draw all fields of the recording and the state of the hand.
+
+        Args:
+            draw: Function that draws the data of one instant.
+        """
+        self._draw = draw
+        for field in self.replay:
+            assert field.stamp is not None
+            if field.stamp.patch in self._pending or self._is_due():
+                self._flush(ending=False)
+            if not self._pending:
+                self._fields_since_ns = self.replay.clock()
+            self._pending[field.stamp.patch] = field
+            self._fields_ns = self.replay.clock()
+        self._watch.check()
+        self._flush(ending=True)
+
+    def _is_due(self) -> bool:
+        return bool(self._pending) and self.replay.clock() - self._fields_since_ns >= 1e9 / RATE_HZ
+
+    def _before_frame(self) -> bool:
+        """Check the health and draw the state if it is time; return whether to end the conversion."""
+        if self._cancelled():
+            return True
+        if self._draw is None:
+            return False
+        now_ns = self.replay.clock()
+        if not self._checked_ns <= now_ns < self._checked_ns + _CHECK_NS:
+            self._checked_ns = now_ns
+            self._watch.check()
+            if not self._state_ns <= now_ns < self._state_ns + STATE_S * 1e9 and now_ns:
+                self._flush(ending=False, state=True)
+        return False
+
+    def _flush(self, *, ending: bool, state: bool = False) -> None:
+        """Draw what is pending and, at the end or if asked, the state of the hand."""
+        assert self._draw is not None
+        now_ns, view = self._fields_ns, None
+        if state or ending:
+            self._state_ns = now_ns = self.replay.clock()
+            view = self._history.add(snapshot_of(self.replay))
+            self.faults.update(view, now_ns, ending=ending)
+        fields, self._pending = self._pending, {}
+        self._drawn += len(fields)
+        self._draw(Tick(now_ns, fields, self.counts, view, drain(self._events)))

@@ -1,0 +1,107 @@
+"""Draws the newest fields of a running host or a replayed recording, on a thread of its own.
+
+The host publishes into a bounded queue, which drops its oldest field if it is full. The thread takes the
+newest field of each patch, at most ``rate_hz`` times per second. Drawing can therefore be slow or block
+without an effect on the host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.errors import SkinError
+from skinnode.model.frames import FieldFrame
+from skinnode.monitor.report import FaultBook
+from skinnode.monitor.source import Source
+from skinnode.monitor.view_model import History
+from skinnode.process import clock
+from skinnode.view.texts import DrawnCounts
+from skinnode.view.tick import Tick
+
+RATE_HZ: Final = 30.0
+"""Default limit of drawn fields per patch and second; screens show at most 60 pictures per second."""
+STATE_S: Final = 0.25
+"""Interval between drawings of health, contacts as text and bus load, s."""
+_QUEUED: Final = 8
+"""Capacity of the queue, in fields per patch."""
+
+
+class DrawingThread:
+    """Thread that draws a source, from construction until :meth:`close`.
+
+    Args:
+        source: Host or recording; the caller closes it.
+        draw: Function that draws the new data, called on the thread.
+        rate_hz: Maximum number of drawn fields per patch and second.
+    """
+
+    def __init__(self, source: Source, draw: Callable[[Tick], None], *, rate_hz: float = RATE_HZ) -> None:
+        self._source, self._draw, self._period_s = source, draw, 1.0 / rate_hz
+        self.faults = FaultBook(live=source.live)
+        self.failure: SkinError | None = None
+        """Error of the source or of the drawing; None if none has occurred."""
+        self._history = History(source.hand, live=source.live)
+        self._fields = source.fields(_QUEUED * len(source.hand.patches))
+        self._drawn = self._left_out = 0
+        self._state_due_s = clock.monotonic()
+        self._stop = clock.event()
+        self._thread = clock.thread(target=self._run, name="draw")
+        self._thread.start()
+
+    @property
+    def counts(self) -> DrawnCounts:
+        """Counts of the fields since the start."""
+        return DrawnCounts(self._drawn, self._left_out, self._fields.dropped)
+
+    def close(self) -> None:
+        """Draw what is still queued, then end and join the thread."""
+        self._stop.set()
+        self._thread.join()
+        self._fields.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        ending = False
+        due_s = clock.monotonic()
+        try:
+            while not ending:
+                ending = self._stop.wait(max(0.0, due_s - clock.monotonic()))
+                due_s = max(due_s + self._period_s, clock.monotonic())
+                self._turn(ending=ending)
+        except SkinError as error:
+            self.failure = error
+        except Exception as error:  # the host must go on, and the user must be told
+            self.failure = SkinError(f"drawing: {error!r}")
+
+    def _turn(self, *, ending: bool) -> None:
+        """Draw the newest field of each patch and, if it is due, the state of the hand."""
+        newest: dict[str, FieldFrame] = {}
+        for _ in range(_QUEUED * len(self._source.hand.patches)):  # a fast host must not occupy the loop
+            field = self._fields.get(0.0)
+            if field is None:
+                break
+            assert field.stamp is not None
+            self._left_out += field.stamp.patch in newest
+            newest[field.stamp.patch] = field
+        now_s = clock.monotonic()
+        due = ending or now_s >= self._state_due_s
+        events = self._source.events()
+        if not (newest or due or events):
+            return
+        self._drawn += len(newest)
+        snapshot, view = self._source.snapshot() if due else None, None
+        if snapshot is not None:
+            self._state_due_s = now_s + STATE_S
+            view = self._history.add(snapshot)
+            self.faults.update(view, clock.monotonic_ns(), ending=ending or self._source.over)
+        t_ns = self._source.now_ns() if snapshot is None else snapshot.t_ns
+        self._draw(Tick(t_ns, newest, self.counts, view, events))

@@ -1,0 +1,120 @@
+"""Opens where a drawing goes: a window, a browser, a file, or a file and one of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from skinnode.errors import ConfigError
+from skinnode.view.viewer_process import (
+    LOCAL,
+    MEMORY,
+    ViewerProcess,
+    free_port,
+    require_display,
+    require_free,
+)
+from skinnode.view.web_page import WebPage
+
+PORT: Final = 9090
+"""Default port of the web page; the browser fetches the data at the next port."""
+SUFFIX: Final = ".rrd"
+
+
+@dataclass(frozen=True, slots=True)
+class OutputOptions:
+    """Where a drawing goes."""
+
+    window: bool
+    web: bool
+    save: Path | None
+    address: str = LOCAL
+    port: int = PORT
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """An open output."""
+
+    viewer: ViewerProcess | None
+    """Window, or server of the data for browsers; None for a file."""
+    page_url: str | None
+    """Address of the web page; None without ``web``."""
+    save: Path | None
+    """File to write; None for no file."""
+
+    def target(self, name: str) -> Target:
+        """Return where to draw.
+
+        Args:
+            name: Name of the recording, shown in the viewer.
+        """
+        return Target(None if self.viewer is None else self.viewer.url, self.save, name)
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Viewer and file to which the SDK sends a drawing."""
+
+    url: str | None
+    """Address of the viewer; None for no viewer."""
+    save: Path | None
+    """File; None for no file."""
+    name: str
+    """Name of the recording, shown in the viewer."""
+
+
+@contextmanager
+def open_output(options: OutputOptions) -> Iterator[Output]:
+    """Check the file and start the viewer; end the viewer on exit.
+
+    Args:
+        options: Where the drawing goes.
+
+    Raises:
+        ConfigError: There is no display, a port is in use, or the file exists or cannot be written.
+        SkinError: The viewer does not start.
+    """
+    if options.save is not None:
+        require_new_file(options.save)
+    with ExitStack() as stack:
+        viewer, page_url = None, None
+        if options.web:
+            viewer, page_url = _serve(stack, options)
+        elif options.window:
+            require_display()
+            shown = ["--expect-data-soon", "--hide-welcome-screen"]
+            viewer = stack.enter_context(ViewerProcess(LOCAL, free_port(), shown))
+        yield Output(viewer, page_url, options.save)
+
+
+def require_new_file(path: Path) -> None:
+    """Raise ConfigError if a recording cannot be written to ``path`` as a new file."""
+    if path.suffix != SUFFIX:
+        raise ConfigError("--save", str(path), f"a file name that ends in {SUFFIX}")
+    try:
+        with path.open("xb"):
+            pass
+        path.unlink()
+    except FileExistsError:
+        raise ConfigError("--save", str(path), "a new file; this one exists") from None
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise ConfigError("--save", str(path), f"a file that can be created ({why})") from None
+
+
+def _serve(stack: ExitStack, options: OutputOptions) -> tuple[ViewerProcess, str]:
+    """Start the server of the data and the web page."""
+    address, port = options.address, options.port
+    require_free(address, port)
+    files_port = free_port()
+    asked = ["--serve-web", "--web-viewer-port", str(files_port), "--server-memory-limit", MEMORY]
+    if address != LOCAL:
+        asked += ["--cors-allow-origin", f"http://*:{port}"]
+    viewer = stack.enter_context(ViewerProcess(address, port + 1, asked))
+    stack.enter_context(WebPage(address, port, port + 1, files_port))
+    shown = f"[{address}]" if ":" in address else address
+    return viewer, f"http://{shown}:{port}/"

@@ -1,0 +1,43 @@
+"""Opens a recording stream of the SDK, which sends a drawing to a viewer, a file or both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Final
+
+import rerun as rr
+
+from skinnode.view.outputs import Target
+
+_APPLICATION: Final = "skinnode"
+_FLUSH_S: Final = 5.0
+_BATCH_MS: Final = 20
+"""Maximum delay of data in the SDK, ms; less than the interval between two pictures."""
+
+
+@contextmanager
+def open_stream(target: Target) -> Iterator[rr.RecordingStream]:
+    """Open a stream; on exit, write what is pending and close it.
+
+    Args:
+        target: Where the drawing goes.
+    """
+    batches = rr.ChunkBatcherConfig.LOW_LATENCY()
+    batches.flush_tick = _BATCH_MS * 1e-3
+    stream = rr.RecordingStream(_APPLICATION, batcher_config=batches)
+    stream.set_log_time_enabled(False)  # all data have times of their own
+    stream.set_log_tick_enabled(False)
+    sinks: list[rr.GrpcSink | rr.FileSink] = []
+    if target.url is not None:
+        sinks.append(rr.GrpcSink(target.url))
+    if target.save is not None:
+        sinks.append(rr.FileSink(str(target.save)))
+    stream.set_sinks(*sinks)
+    stream.send_recording_name(target.name)
+    try:
+        yield stream
+    finally:
+        with suppress(RuntimeError):  # a viewer that has gone or does not read; a file is written up to here
+            stream.flush(timeout_sec=_FLUSH_S)
+        stream.disconnect()

@@ -1,0 +1,171 @@
+"""Serves the viewer of rerun-sdk to a browser, without any access to other computers.
+
+The page of the SDK loads fonts from elsewhere, and its viewer sends usage statistics. This server passes the
+page on without the fonts and with a content security policy: the browser refuses every connection except to
+this server and to the port on which the data are. The setting that the viewer keeps in the browser is also
+switched off.
+"""
+
+from __future__ import annotations
+
+import http.client
+import re
+import shutil
+import socket
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import TracebackType
+from typing import Final, Self
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+from skinnode.view.viewer_process import LOCAL, require_free
+
+_FILES: Final = ("/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/apple-touch-icon.png")
+_ELSEWHERE: Final = re.compile(
+    rb"<link\b[^>]*https?://[^>]*>|<script\b[^>]*\bsrc=\"https?://[^>]*>\s*</script>"
+)
+"""Elements of the page that load something from another computer."""
+_HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
+_NO_STATISTICS: Final = (
+    b"<script>localStorage.setItem('rerun_config', "
+    b"JSON.stringify({analytics_id: 'none', analytics_enabled: false}));</script>"
+)
+_OPTIONS: Final = {"hide_welcome_screen": "1", "persist": "0"}
+"""Query of the page: neither the welcome screen, which loads examples, nor the layout of an earlier visit."""
+
+
+class WebPage:
+    """Web server of the viewer's page, from construction until :meth:`close`.
+
+    Args:
+        address: Address on which to listen.
+        port: Port on which to listen.
+        data_port: Port at which the browser fetches the data.
+        files_port: Port of this machine at which the SDK serves the files of its viewer.
+
+    Raises:
+        ConfigError: The port is in use or the address does not belong to this machine.
+    """
+
+    def __init__(self, address: str, port: int, data_port: int, files_port: int) -> None:
+        require_free(address, port)
+
+        class Handler(_Handler):
+            ports = (data_port, files_port)
+            otherwise = address
+
+        kind = type("Server", (ThreadingHTTPServer,), {"address_family": _family(address)})
+        self._server: ThreadingHTTPServer = kind((address, port), Handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, name="web page", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def policy(host: str, data_port: int) -> str:
+    """Return the content security policy of the page.
+
+    Args:
+        host: Name or address of this computer, as the browser knows it.
+        data_port: Port at which the browser fetches the data.
+    """
+    return (
+        "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; "
+        "style-src 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self' blob:; "
+        "object-src 'none'; base-uri 'none'; "
+        f"connect-src 'self' blob: data: http://{host}:{data_port}"
+    )
+
+
+def page_of(page: bytes) -> bytes:
+    """Return the page of the SDK without parts from elsewhere and with usage statistics switched off."""
+    return _ELSEWHERE.sub(b"", page).replace(b"<head>", b"<head>" + _NO_STATISTICS, 1)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers GET for the page and for the files of the viewer; anything else does not exist."""
+
+    ports: tuple[int, int]
+    otherwise: str
+    """Name of this computer for a browser that names none."""
+    protocol_version = "HTTP/1.1"
+    timeout = 30.0
+
+    def do_GET(self) -> None:
+        """Answer a request."""
+        path, query = urlsplit(self.path).path, dict(parse_qsl(urlsplit(self.path).query))
+        try:
+            if path in _FILES:
+                self._pass_on(path)
+            elif path != "/":
+                self._answer(404, "text/plain", b"not found")
+            elif "url" in query:
+                self._answer(200, "text/html; charset=utf-8", page_of(self._fetch("/")))
+            else:
+                self.send_response(302)
+                self.send_header("Location", "/?" + urlencode({"url": self._data_url(), **_OPTIONS, **query}))
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+        except (OSError, http.client.HTTPException):
+            self.close_connection = True  # the browser or the SDK's server has gone
+
+    def _host(self) -> str:
+        """Return the name of this computer as the browser wrote it, without the port."""
+        named = re.sub(r":\d+$", "", self.headers.get("Host", ""))
+        return named if _HOST.fullmatch(named) else self.otherwise
+
+    def _data_url(self) -> str:
+        return f"rerun+http://{self._host()}:{self.ports[0]}/proxy"
+
+    def _fetch(self, path: str) -> bytes:
+        connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
+        connection.request("GET", path)
+        with connection.getresponse() as answer:
+            return answer.read()
+
+    def _pass_on(self, path: str) -> None:
+        """Pass on a file of the SDK piece by piece: the largest has 43 MB."""
+        connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
+        connection.request("GET", path)
+        with connection.getresponse() as answer:
+            self.send_response(answer.status)
+            self.send_header("Content-Type", answer.getheader("Content-Type", "application/octet-stream"))
+            length = answer.getheader("Content-Length") or answer.getheader("rerun-final-length")
+            if length is not None:
+                self.send_header("Content-Length", length)
+            self.send_header("rerun-final-length", answer.getheader("rerun-final-length") or "")
+            self.send_header("Cache-Control", "max-age=3600")
+            self.send_header("Connection", "close")
+            self.end_headers()
+            shutil.copyfileobj(answer, self.wfile, 1 << 18)
+        self.close_connection = True
+
+    def _answer(self, status: int, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Security-Policy", policy(self._host(), self.ports[0]))
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing: stderr is for the messages of the command."""
+
+
+def _family(address: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in address else socket.AF_INET

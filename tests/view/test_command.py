@@ -1,0 +1,91 @@
+"""What ``skinnode view`` says where it cannot run: one line, exit status 2."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = "from skinnode.cli.main import main; main()"
+
+
+def run(*arguments: str, code: str = PROGRAM, **variables: str) -> subprocess.CompletedProcess[str]:
+    kept = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code, "view", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        stdin=subprocess.DEVNULL,
+        env={**kept, **variables},
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate and --replay RECORDING"),
+        (["--simulate", "--replay", "x.log"], "HAND.toml: got both it and --replay"),
+        (["--simulate"], "display: got none, allowed: a graphical session, or --web, or --save FILE.rrd"),
+        (["/nowhere.toml", "--web"], "nowhere.toml"),
+        (["--replay", "/nowhere.log", "--web"], "nowhere"),
+        (["--replay", "/nowhere.log", "--save", "x.rrd"], "nowhere"),
+        (["--simulate", "--speed", "2", "--web"], "--speed: got 2.0, allowed: only with --replay"),
+        (["--simulate", "--channel", "can1", "--web"], "--channel: got 'can1', allowed: only without"),
+        (["--simulate", "--port", "9000"], "--port: got 9000, allowed: only with --web"),
+        (["--simulate", "--address", "0.0.0.0"], "--address: got '0.0.0.0', allowed: only with --web"),
+        (["--simulate", "--web", "--address", "nowhere at all"], "port: got 'nowhere at all:9090', allowed"),
+        (["--simulate", "--web", "--port", "0"], "--port"),
+        (["--simulate", "--rate", "0"], "--rate"),
+        (["--simulate", "--rate", "nan"], "--rate"),
+        (["--simulate", "--exaggerate", "-1"], "--exaggerate"),
+        (["--simulate", "--save", ""], "--save: got '', allowed: a file name that ends in .rrd"),
+        (["--simulate", "--save", "/nowhere/x.rrd"], "a file that can be created (No such file"),
+        (["--simulate", "--save", "/proc/x.rrd"], "a file that can be created ("),
+    ],
+)
+def test_what_cannot_run_is_one_line(arguments: list[str], said: str, tmp_path: Path, sdk: None) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+    assert not Path("x.rrd").exists()
+
+
+def test_a_port_in_use_is_one_line(sdk: None) -> None:
+    with socket.socket() as used:
+        used.bind(("127.0.0.1", 0))
+        used.listen()
+        port = used.getsockname()[1]
+        for taken in (port, port - 1):  # the page, and the data at the next port
+            done = run("--simulate", "--web", "--port", str(taken))
+            assert (done.returncode, done.stdout) == (2, "")
+            assert done.stderr == (
+                f"error: port: got '127.0.0.1:{port}', allowed: a free port (Address already in use)\n"
+            )
+
+
+def test_without_the_sdk_one_line_says_what_to_install() -> None:
+    hidden = "import importlib.util as u; found = u.find_spec\n"
+    hidden += "u.find_spec = lambda name, *more: None if name == 'rerun' else found(name, *more)\n"
+    done = run("--simulate", code=hidden + PROGRAM)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "error: skinnode view: got no package rerun-sdk, "
+        "allowed: the package rerun-sdk (sh install.sh view)\n"
+    )
+
+
+def test_a_display_that_does_not_exist_is_one_line(sdk: None) -> None:
+    done = run("--simulate", DISPLAY=":99")
+    assert (done.returncode, done.stdout) == (2, "")
+    errors = [
+        line for line in done.stderr.splitlines() if not line.startswith("node ")
+    ]  # from the host's log
+    assert len(errors) == 1
+    assert errors[0].startswith("error: the viewer ended: ")

@@ -127,7 +127,7 @@ class Segment:
         self._plan()
 
     def send(self, station: int, frame: CanFrame) -> None:
-        """Queue a frame of a station for transmission."""
+        """Queue a frame from a station for transmission."""
         self.bus.send(self.clock.now_ns, station, frame)
         if self._due_ns is None or self.bus.waiting(station) == 1:  # otherwise, already planned
             self._plan()

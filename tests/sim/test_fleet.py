@@ -20,6 +20,7 @@ from skinnode.protocol.device_time import restore_time_us
 from skinnode.protocol.summary import unpack_summary
 from skinnode.transport import CanPort, Frame
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
 PATIENCE_S = 10.0
@@ -166,6 +167,17 @@ def test_patches_sit_on_their_own_buses() -> None:
         assert {f.can_id & 0x7F for f in first.scan(5, 7)} == {5, 7}
         assert {f.can_id & 0x7F for f in second.scan(6)} == {6}
         assert not fleet.failed
+
+
+def test_all_buses_stop_at_the_same_time() -> None:
+    """A node thread notices the end within 0.1 s; ten threads, one after the other, would take a second."""
+    with VirtualClock() as virtual:
+        fleet = Fleet(hand(buses=10, patches=10).on("timed", None))
+        fleet.start()
+        before_ns = virtual.now_ns
+        fleet.stop()
+        assert virtual.now_ns - before_ns <= 100_000_000
+        fleet.stop()
 
 
 def test_a_bus_that_does_not_open_leaves_nothing_running() -> None:

@@ -1,4 +1,4 @@
-"""Measure what `skinnode view` costs: 16 patches on four CAN FD buses, at 40 SYNCs per second.
+"""Measure the cost of `skinnode view` for 16 patches on four CAN FD buses at 40 SYNCs per second.
 
     python docs/view_cost.py [SECONDS]
 

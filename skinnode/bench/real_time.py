@@ -37,7 +37,7 @@ Row = dict[str, Any]
 
 
 class _Counts(NamedTuple):
-    """Simulator counters since its start."""
+    """Simulator counters, from its start."""
 
     cpu_s: float
     frames: int
@@ -52,7 +52,7 @@ def run(seconds: float) -> dict[str, Any]:
         seconds: Duration of each measurement, s.
 
     Returns:
-        ``rows``, the results of :func:`measure`, and ``frame_us``, those of :func:`frame_us`.
+        ``rows``: results of :func:`measure`; ``frame_us``: result of :func:`frame_us`.
     """
     return {
         "rows": [measure(PATCHES, TOUCHED, hop_limit, seconds) for hop_limit in HOP_LIMITS],

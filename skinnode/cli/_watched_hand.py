@@ -36,7 +36,7 @@ Simulate = Annotated[
 
 
 def require_one_source(hand: Path | None, replay: Path | None, *, simulate: bool) -> None:
-    """Raise ConfigError unless the user has given either a hand or a recording, but not both."""
+    """Raise ConfigError unless the options select exactly one source: a hand or a recording."""
     from skinnode.errors import NOTHING, ConfigError, Shown
 
     if (hand is not None or simulate) == (replay is not None):
@@ -59,7 +59,7 @@ def require_used(
 
 
 def plan_of(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """Return the hand to run, with settings that let the host wait for missing patches."""
+    """Return the hand to run, with settings that make the host wait for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 

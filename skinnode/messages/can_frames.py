@@ -77,7 +77,7 @@ class FrameEncoder:
 
 
 def frame_of(data: bytes, name: str) -> Frame:
-    """Return the CAN frame of an encoded message; ``t_ns`` is a time since 1970.
+    """Return the CAN frame from an encoded message; the frame's ``t_ns`` is a time since 1970.
 
     Args:
         data: Message as CDR.

@@ -35,7 +35,7 @@ def contacts_message(field: FieldFrame, t_ns: int) -> Any:
 
 
 def contact_wrenches(field: FieldFrame, t_ns: int) -> list[Any]:
-    """Return the wrench of each contact as ``geometry_msgs/WrenchStamped``, strongest contact first.
+    """Return each contact's wrench as ``geometry_msgs/WrenchStamped``, strongest contact first.
 
     The force acts on the skin. The torque is taken about the origin of the patch frame: it is the cross
     product of the contact's position and force.

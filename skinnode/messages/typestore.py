@@ -32,7 +32,7 @@ def require_mcap(option: str) -> None:
 
 @functools.cache
 def typestore() -> Typestore:
-    """Return the rosbags typestore with the standard messages of ROS 2 Humble and our own messages."""
+    """Return the rosbags typestore with the ROS 2 Humble standard messages and our own messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)

@@ -45,9 +45,9 @@ class Conversion:
     fields: int
     """Number of fields written."""
     faults: tuple[str, ...]
-    """Missing or unreadable parts of the source."""
+    """Messages about missing or unreadable parts of the source."""
     notes: tuple[str, ...]
-    """Data that the target cannot contain, and assumptions."""
+    """Messages about assumptions, and about data that the target cannot contain."""
 
 
 class FieldTable(Protocol):

@@ -1,8 +1,8 @@
 """Converts fields to table rows: one row per field; no value is missing.
 
-The file formats have no missing values, so a value that a field lacks is replaced: NaN for an unknown number,
-False for an unknown mask, 1 for an unknown data share, and ``displacement_std_m`` for an unknown
-``core_std_m``. The column ``tested`` shows whether ``wires_trusted`` is known.
+Values that a field lacks are filled in: NaN for an unknown number, False for an unknown mask, 1 for an
+unknown data share, and ``displacement_std_m`` for an unknown ``core_std_m``. The column ``tested`` shows
+whether ``wires_trusted`` is known.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ class McapChunks:
                 at = end
                 continue
             following = _find_chunk(data, at + 1)
-            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage has been recorded
+            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage is already recorded
                 self.complain(at, "truncated" if following == size else "no record")
             at = following
 

@@ -89,7 +89,7 @@ class ReplayedBus:
         self._dispatcher.measure(frame.t_ns)
 
     def _go_on(self, can_id: int) -> None:
-        """Resume with the same solver after a node restart, because no journal records when the host resumed.
+        """Resume with the same solver after a node restart; no journal states when the host did.
 
         After a baseline change, scans remain withheld, because the new baseline is unknown.
         """

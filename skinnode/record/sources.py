@@ -68,7 +68,7 @@ class ChannelMap:
 
 @dataclass(frozen=True, slots=True)
 class OpenRecording:
-    """Frames and journal of an open recording."""
+    """Open recording: its frames and journal."""
 
     frames: Frames
     header: Header

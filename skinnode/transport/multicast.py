@@ -268,7 +268,7 @@ def limit_to_group(sock: socket.socket) -> None:
 
 
 def _discard_other_groups(sock: socket.socket) -> None:
-    """Discard packets that were received before reception was limited to one multicast group.
+    """Discard packets received before reception was limited to one multicast group.
 
     If there were any, discard again after a pause, because the kernel may still be delivering packets.
     """

@@ -6,7 +6,7 @@ Data flows in one direction::
         -> drawing_process (child process) -> drawing -> stream of the SDK -> window, browser or file
     recording -> conversion -> tick -> drawing -> stream -> file
 
-``picture`` computes a field's picture from the shapes in ``geometry`` and the colours in ``colours``;
+``picture`` computes a field's picture, using shapes from ``geometry`` and colours from ``colours``;
 ``placement`` positions the patches. ``texts`` writes Markdown tables. ``drawing`` writes both to a recording
 ``stream``; ``blueprint`` defines the window layout. ``outputs`` opens windows, pages and files:
 ``viewer_process`` runs the viewer as a child process, and ``web_page`` serves it to a browser without access

@@ -94,7 +94,7 @@ class DrawingProcess:
         self.close()
 
     def _complaint(self) -> str:
-        """Return why the child process has ended."""
+        """Return the reason why the child process has ended."""
         with suppress(EOFError, OSError):
             if self._connection.poll(1.0):
                 return str(self._connection.recv())

@@ -137,7 +137,7 @@ class _Handler(BaseHTTPRequestHandler):
             return answer.read()
 
     def _pass_on(self, path: str) -> None:
-        """Pass on an SDK file in pieces, because the largest file has 43 MB."""
+        """Pass on an SDK file in pieces, because the largest file is 43 MB."""
         connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
         connection.request("GET", path)
         with connection.getresponse() as answer:

@@ -1,11 +1,10 @@
-"""Measure what `skinnode view` costs: 16 patches on four CAN FD buses, at 40 SYNCs per second.
+"""Measure the cost of `skinnode view` for 16 patches on four CAN FD buses at 40 SYNCs per second.
 
     python docs/view_cost.py [SECONDS]
 
-The load is that of `skinnode bench pipeline`: a child process replays the frames of a touched hand over UDP.
-The hand is measured several times, in turn without a view and with a view that writes to the server of the
-browser's data. The host runs on one core; the generator, the drawing and the server of
-the data run on another.
+The load is the same as in `skinnode bench pipeline`: a child process replays the frames of a touched hand
+over UDP. The script alternates between runs without a view and runs with a view that writes to the browser's
+data server. The host runs on one core; the generator, the drawing and the data server run on another.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ ROUNDS: Final = 3
 
 
 def cpu_s(name: str) -> float:
-    """Return the CPU time of the threads of this process with a given name, s."""
+    """Return the total CPU time (s) of this process's threads with the given name."""
     ids = [thread.native_id for thread in threading.enumerate() if thread.name == name]
     texts = [Path(f"/proc/self/task/{number}/schedstat").read_text() for number in ids]
     return sum(int(text.split()[0]) * 1e-9 for text in texts)
@@ -48,7 +47,7 @@ def measure(hand: Any, generator: Generator, core: int, *, viewed: bool) -> dict
     own = os.sched_getaffinity(0)
     with ExitStack() as stack:
         if viewed:
-            os.sched_setaffinity(0, {core})  # for the server of the data, which inherits it
+            os.sched_setaffinity(0, {core})  # inherited by the data server
             options = OutputOptions(window=False, web=True, save=None, port=free_port())
             output = stack.enter_context(open_output(options))
             how = DrawingOptions(10.0, time.time_ns() - time.monotonic_ns(), live=True)

@@ -1,13 +1,13 @@
-"""Create the screenshot of `skinnode view --web` for the documentation, with Debian's chromium.
+"""Create the documentation's screenshot of `skinnode view --web` with Debian's Chromium.
 
     python docs/view_picture.py          writes docs/img/view.png
 
 Requires the packages rerun-sdk (sh install.sh view) and playwright (pip), and the program chromium
-(apt-get install chromium). The script records a simulated hand of six patches until all are pressed. It then
-shows the recording with the command and opens the page in a browser without a screen. A browser without a
-graphics card needs all cores of a small computer for about a second per picture, so a hand that runs at the
-same time would lose scans. At the end, the script prints the requests to other computers that the page tried
-to send.
+(apt-get install chromium). The script records a simulated hand with six patches until all are pressed. Then
+the script shows the recording with `skinnode view --web` and opens the page in a headless browser. The script
+uses a recording because a browser without a graphics card needs about a second per frame on all cores of a
+small computer; a hand running at the same time would lose scans. At the end, the script prints the requests
+that the page tried to send to other computers.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ OPTIONS: Final = [
 SIZE: Final = {"width": 1400, "height": 860}
 PATIENCE_S: Final = 120.0
 SHOWN_S: Final = 45.0
-"""Time until the picture is taken, s."""
+"""Delay before the screenshot, s."""
 PATCHES: Final = 6
 PRESSED_N: Final = 1.5
 LONGEST_S: Final = 40.0
 
 
 def record(path: Path) -> None:
-    """Record a hand until all its patches are pressed."""
+    """Record a simulated hand until all its patches are pressed."""
     hand = demo_hand(PATCHES, seed=3)
     solver = hand.solver.model_copy(update={"method": "posterior"})
     hand = hand.model_copy(update={"name": "simulated hand", "solver": solver})
@@ -60,7 +60,7 @@ def record(path: Path) -> None:
 
 
 def picture_of(url: str, file: Path) -> list[str]:
-    """Write a screenshot of the page; return the requests to other computers that it tried to send."""
+    """Write a screenshot of the page and return the requests it tried to send to other computers."""
     elsewhere: list[str] = []
 
     def watch(route: Route) -> None:
@@ -98,7 +98,7 @@ def main() -> None:
             found = re.search(r"http://\S+", shown.stdout.readline())
             if found is None:
                 raise SystemExit("skinnode view did not start")
-            shown.stdout.readline()  # the end of the recording
+            shown.stdout.readline()  # the line that reports the end of the recording
             elsewhere = picture_of(found.group(), PICTURE)
         finally:
             shown.terminate()

@@ -1,4 +1,4 @@
-"""Measures the memory that the process occupies."""
+"""Measures the process's memory use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def resident_mb() -> float:
-    """Return the resident memory of the process, MB, after all unused memory has been freed. Linux only."""
+    """Free all unused memory and return the process's resident memory (MB). Linux only."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:

@@ -1,7 +1,7 @@
-"""Measures the CPU time of the simulator in real time on udp_multicast, and the time to exchange a frame.
+"""Measures the simulator's CPU time in real time on udp_multicast, and the time to exchange a frame.
 
-The simulator runs in a process of its own, as ``vcan-sim`` does, beside the process of the host. The hand has
-sixteen patches on four buses. Spheres press on four patches, and all chunks are sent.
+The simulator and the host run in separate processes, as they do with ``vcan-sim``. The hand has sixteen
+patches on four buses. Spheres press on four patches, and all chunks are sent.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from vcan_sim.fleet import Fleet
 PATCHES: Final = 16
 TOUCHED: Final = 4
 HOP_LIMITS: Final = (1, 0)
-"""Values of python-can's option ``hop_limit``: 1, the default, sends each frame to the network as well; with
-0, the frames stay on this machine."""
+"""Values of python-can's ``hop_limit`` option. With 1, the default, each frame is also sent to the network;
+with 0, frames stay on this machine."""
 _SETTLED_S: Final = 3.0
-"""Time from bring-up to measurement, s."""
+"""Time between bring-up and measurement, s."""
 _BURST: Final = 16
-"""Number of frames sent at a time, when the exchange of frames is timed."""
+"""Number of frames sent at a time when the frame exchange is timed."""
 
 Row = dict[str, Any]
 
 
 class _Counts(NamedTuple):
-    """Counters of the simulator since its start."""
+    """Simulator counters, from its start."""
 
     cpu_s: float
     frames: int
@@ -52,7 +52,7 @@ def run(seconds: float) -> dict[str, Any]:
         seconds: Duration of each measurement, s.
 
     Returns:
-        ``rows``, the results of :func:`measure`, and ``frame_us``, those of :func:`frame_us`.
+        ``rows``: results of :func:`measure`; ``frame_us``: result of :func:`frame_us`.
     """
     return {
         "rows": [measure(PATCHES, TOUCHED, hop_limit, seconds) for hop_limit in HOP_LIMITS],
@@ -61,19 +61,19 @@ def run(seconds: float) -> dict[str, Any]:
 
 
 def measure(patches: int, touched: int, hop_limit: int, seconds: float) -> Row:
-    """Run a simulator and a host in real time, in one process each.
+    """Run a simulator and a host in real time, each in its own process.
 
     Args:
         patches: Number of patches.
         touched: Number of touched patches.
-        hop_limit: Option ``hop_limit`` of all buses.
+        hop_limit: ``hop_limit`` option of all buses.
         seconds: Duration of the measurement, s.
 
     Returns:
-        The arguments; the CPU times of the two processes divided by the duration (``simulator``, ``host``);
-        the number of frames that the nodes sent per second (``frames_per_s``); the numbers of ``scans`` sent,
-        of scans ``skipped`` because the machine was too busy, and of ``fields`` solved; and the ``load`` of
-        the machine, averaged over the last minute.
+        The arguments; the two processes' CPU times divided by the duration (``simulator``, ``host``); the
+        number of frames that the nodes sent per second (``frames_per_s``); the numbers of ``scans`` sent,
+        scans ``skipped`` because the machine was too busy, and ``fields`` solved; and the machine's ``load``,
+        averaged over the last minute.
     """
     hand = on_multicast(hand_of(patches), hop_limit)
     context = multiprocessing.get_context("spawn")
@@ -114,7 +114,7 @@ def measure(patches: int, touched: int, hop_limit: int, seconds: float) -> Row:
 
 
 def on_multicast(hand: HandConfig, hop_limit: int) -> HandConfig:
-    """Return a copy of the hand on multicast groups chosen at random."""
+    """Return a copy of the hand that uses randomly chosen multicast groups."""
     groups = random.sample(range(1 << 16), len(hand.buses))
     buses = tuple(
         _multicast_bus(bus.name, group, hop_limit) for bus, group in zip(hand.buses, groups, strict=True)
@@ -132,7 +132,7 @@ def _multicast_bus(name: str, group: int, hop_limit: int) -> BusConfig:
 
 
 def _simulate(pipe: Connection, hand: HandConfig, touched: int) -> None:
-    """Run the nodes, and send the counters on every request, until the parent closes its end of the pipe."""
+    """Run the nodes and send the counters on request until the parent closes its end of the pipe."""
     with Fleet(hand, scene=scene_of(touched)) as fleet, without_long_collections():
         while True:
             try:
@@ -164,8 +164,8 @@ def frame_us() -> dict[str, float]:
     """Time the exchange of a frame between two endpoints that both receive it.
 
     Returns:
-        ``python_can`` and ``port``, the time with python-can and with :class:`~skinnode.transport.CanPort`,
-        µs.
+        Time per frame, µs: ``python_can`` with python-can, ``port`` with
+        :class:`~skinnode.transport.CanPort`.
     """
     one, two = (_multicast_bus("can0", random.randrange(1 << 16), 0) for _ in range(2))
     with ExitStack() as opened:

@@ -1,8 +1,7 @@
-"""Measures size, write cost and seek time of recordings at the rate of fully loaded buses.
+"""Measures the size, write cost and seek time of recordings from fully loaded buses.
 
-The frames are those of simulated nodes with exact times, and the fields are computed from them by a replay. A
-block of a few seconds is written again and again, with later times, until the recording has the requested
-length.
+The frames come from simulated nodes with exact times, and a replay computes the fields from them. A block of
+a few seconds is written repeatedly, with later times, until the recording has the requested length.
 """
 
 from __future__ import annotations
@@ -38,33 +37,33 @@ SEEKS: Final = 20
 HOUR_S: Final = 3600.0
 
 _BEGIN_NS: Final = 1_790_000_000_000_000_000
-"""Time of the first frame since 1970, ns: an arbitrary time."""
+"""Arbitrary time of the first frame since 1970, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Traffic of a few seconds."""
+    """A few seconds of traffic."""
 
     hand: HandConfig
     seconds: float
     frames: list[tuple[str, Frame]]
-    """Name of the bus, and frame, in the order of time; ``t_ns`` counts from the start of the block."""
+    """Bus name and frame, in chronological order; ``t_ns`` counts from the start of the block."""
     fields: list[FieldFrame]
 
 
 def run(
     buses: int, minutes: float, seconds: float, report: Callable[[dict[str, Any]], None]
 ) -> dict[str, Any]:
-    """Write recordings of each format, and seek in the MCAP file.
+    """Write a recording in each format, and measure seeking in the MCAP file.
 
     Args:
         buses: Number of fully loaded buses with four patches each.
-        minutes: Duration of each recording.
-        seconds: Duration of the block of simulated traffic.
-        report: Function that receives the results of each format as soon as they are complete.
+        minutes: Duration of each recording, min.
+        seconds: Duration of the block of simulated traffic, s.
+        report: Function that receives each format's results as soon as they are complete.
 
     Returns:
-        Results of each format and of seeking.
+        Results for each format and for seeking.
     """
     rows = []
     with tempfile.TemporaryDirectory() as name:
@@ -89,7 +88,7 @@ def run(
 
 
 def block_of(buses: int, seconds: float, folder: Path) -> Block:
-    """Simulate traffic, and solve its scans."""
+    """Simulate traffic and solve its scans."""
     hand = full_hand(buses, False, 0.0, "udp", "", folder, one_worker=True)
     streams = [_frames(hand, bus.name, seconds) for bus in hand.buses]
     frames = list(heapq.merge(*streams, key=lambda item: item[1].t_ns))
@@ -112,7 +111,7 @@ def _frames(hand: HandConfig, bus: str, seconds: float) -> Iterator[tuple[str, F
 
 
 def _write(block: Block, blocks: int, path: Path, *, with_fields: bool) -> dict[str, Any]:
-    """Write a recording, and measure the processor time of frames, fields and flushes separately."""
+    """Write a recording; measure the CPU time for frames, fields and flushes separately."""
     file = McapFile(path, block.hand) if path.suffix == ".mcap" else LogFiles(path, block.hand)
     file.write_line(Header(block.hand, "", 0).line(), _BEGIN_NS)
     steps = _steps(block)
@@ -156,7 +155,7 @@ def _write(block: Block, blocks: int, path: Path, *, with_fields: bool) -> dict[
 
 
 def _steps(block: Block) -> list[tuple[list[tuple[str, Frame]], list[FieldFrame]]]:
-    """Divide a block into the frames and fields between two flushes."""
+    """Divide a block into groups of frames and fields, one group per flush."""
     count = round(block.seconds / FLUSH_S)
     steps: list[tuple[list[tuple[str, Frame]], list[FieldFrame]]] = [([], []) for _ in range(count)]
 
@@ -172,7 +171,7 @@ def _steps(block: Block) -> list[tuple[list[tuple[str, Frame]], list[FieldFrame]
 
 
 def seek_times(path: Path, topic: str) -> dict[str, float]:
-    """Measure how long mcap's reader takes to open a file, and to find the first message at random times.
+    """Measure how long mcap's reader takes to open a file and to find the first message after random times.
 
     Args:
         path: The file.

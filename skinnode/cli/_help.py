@@ -1,7 +1,7 @@
-"""Help texts of commands: docstrings as running text, and no type beside options without a value.
+"""Formats command help: docstrings as running text, and no type beside options that take no value.
 
-Typer keeps the line breaks of a docstring, which then fall in the middle of the lines of a terminal. It also
-prints ``<bool>`` beside each option that takes no value.
+Typer keeps a docstring's line breaks, which then fall in the middle of a terminal's lines. Typer also prints
+``<bool>`` beside each option that takes no value.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def running_text(help_text: str | None) -> str | None:
-    """Return a help text with each paragraph on a single line; list items keep lines of their own."""
+    """Return a help text with each paragraph on a single line; each list item keeps its own line."""
     if help_text is None:
         return None
     return re.sub(r"(?<!\n)\n(?!\n|\s*[-*] )", " ", inspect.cleandoc(help_text))
@@ -32,7 +32,7 @@ def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
 
 
 class Command(TyperCommand):
-    """Command whose help is formatted as described in the module's docstring."""
+    """Command whose help is formatted as described in the module docstring."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **{**options, "help": running_text(options.get("help"))})
@@ -43,7 +43,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """Command group whose help is formatted as described in the module's docstring."""
+    """Command group whose help is formatted as described in the module docstring."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the parameters and the help option."""
@@ -51,7 +51,7 @@ class Group(TyperGroup):
 
 
 class App(typer.Typer):
-    """Typer application whose help is formatted as described in the module's docstring."""
+    """Typer application whose help is formatted as described in the module docstring."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{"cls": Group, **options})

@@ -1,4 +1,4 @@
-"""Prints the reports of ``skinnode host``: text or a JSON object every second, and faults at the end."""
+"""Prints the ``skinnode host`` reports: text or a JSON object every second, and faults at the end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ whichever is longer."""
 _POLL_S = 0.01
 
 _FIRST_SCANS = 3
-"""Number of SYNCs after which a patch that has not sent a scan is reported as faulty."""
+"""Number of SYNCs after which a patch without a solved scan is reported as faulty."""
 
 _EXPLAINED_BY_SLOWNESS: Final = (
     "scans_torn",
@@ -34,7 +34,7 @@ _EXPLAINED_BY_SLOWNESS: Final = (
     "chunks_lost",
     "summaries_lost",
 )
-"""Counters of missing and late frames, which a slow computer can cause. Wrong frames are always faults."""
+"""Counters of missing and late frames, which a slow computer can cause. Invalid frames are always faults."""
 
 
 def operational_text(running: Host) -> str:
@@ -62,10 +62,10 @@ def final_state_text(plan: HandConfig) -> str:
 
 
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
-    """Return the faults and the notes of the run, one line each.
+    """Return the run's faults and notes, one line each.
 
-    A node whose computer is too slow skips scans and sends EMCY 0x8110. The missing and late frames of such a
-    node are reported as notes, not as faults, and so is an EMCY 0x8110 that is still active at the end. Wrong
+    A node whose computer is too slow skips scans and sends EMCY 0x8110. The node's missing and late frames
+    are then reported as notes, not as faults, as is an EMCY 0x8110 that is still active at the end. Invalid
     frames remain faults.
     """
     _let_overruns_end(running)
@@ -129,7 +129,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Describe the measured noise and the noise stated in the hand file; empty if they agree."""
+    """Describe the measured noise and the noise stated in the hand file; empty if the two agree."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -138,7 +138,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why a patch is faulty or refused; empty for all other patches."""
+    """Return ``before`` and the reason why the patch is faulty or refused; empty in any other condition."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -223,7 +223,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the depth of the deepest electrode (positive towards −z) and its standard deviation, m."""
+    """Return the deepest electrode's depth (positive towards −z) and its standard deviation, m."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -232,12 +232,12 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
 
 
 def _finite(value: float | None) -> float | None:
-    """Return the value as JSON can express it: the largest float for inf."""
+    """Replace a non-finite value with the largest float, because JSON cannot represent infinity."""
     return value if value is None or math.isfinite(value) else sys.float_info.max
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    """Return a percentile (ms) of sorted times (s); None if there are no times."""
+    """Return a percentile (ms) of the sorted times (s); None if there are no times."""
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
 
 
@@ -248,7 +248,7 @@ class Report(Protocol):
         """Report an event or a fault."""
 
     def second(self, second: Second) -> None:
-        """Report the past second of the run."""
+        """Report the values of the past second."""
 
 
 class TextReport:
@@ -291,7 +291,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Describe whether a field is imprecise, and how many faults its readings have; may be empty."""
+    """Describe a field's imprecision and the number of faults in its readings; empty if there are none."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} in the readings; the affected readings are excluded"

@@ -36,7 +36,7 @@ Simulate = Annotated[
 
 
 def require_one_source(hand: Path | None, replay: Path | None, *, simulate: bool) -> None:
-    """Raise ConfigError unless there is exactly one thing to watch: a hand or a recording."""
+    """Raise ConfigError unless the options select exactly one source: a hand or a recording."""
     from skinnode.errors import NOTHING, ConfigError, Shown
 
     if (hand is not None or simulate) == (replay is not None):
@@ -47,7 +47,7 @@ def require_one_source(hand: Path | None, replay: Path | None, *, simulate: bool
 def require_used(
     interface: str | None, channel: str | None, speed: float | None, *, played: bool, simulated: bool
 ) -> None:
-    """Raise ConfigError for an option without effect on a recording or a simulated hand."""
+    """Raise ConfigError if an option would have no effect on a recording or a simulated hand."""
     from skinnode.errors import ConfigError
 
     if speed is not None and not played:
@@ -67,7 +67,7 @@ def plan_of(hand: Path | None, interface: str | None, channel: str | None, simul
         plan = load_hand(hand).on(interface, channel)
     else:
         plan = demo_hand(_SIMULATED, seed=1)
-        # only the method "posterior" computes contact forces
+        # only the "posterior" method computes contact forces
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
     if simulate:
@@ -91,11 +91,11 @@ def running(
     Raises the same errors as :meth:`Host.from_config`.
 
     Args:
-        stack: Stack that closes what is opened here.
+        stack: Stack that closes the resources opened here.
         plan: The hand.
         stop: Event that cancels the start.
         simulate: Whether to simulate the patches.
-        tell: Function that shows the current step.
+        tell: Function that displays the current step.
     """
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host

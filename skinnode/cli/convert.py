@@ -1,4 +1,4 @@
-"""``skinnode convert SOURCE TARGET``: converts recordings, and computes tables of fields."""
+"""``skinnode convert SOURCE TARGET``: converts recordings, and computes field tables."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def convert(
 ) -> None:
     """Convert a recording to another format, or to a table of its fields and resistances.
 
-    Formats with frames: .mcap (MCAP for ROS 2), .log (candump), .blf and .asc (Vector). Tables of fields:
-    .parquet and .npz. The fields are computed as by `skinnode replay`. A note says what the target cannot
-    contain. A damaged MCAP file is repaired by converting it to a new MCAP file.
+    Formats with frames: .mcap (MCAP for ROS 2), .log (candump), .blf and .asc (Vector). Field tables:
+    .parquet and .npz. The fields are the same as those computed by `skinnode replay`. A note lists the data
+    that the target cannot contain. To repair a damaged MCAP file, convert it to a new MCAP file.
 
-    The exit status is 1 if the source is damaged or incomplete, 2 if it could not be converted.
+    The exit status is 1 if the source is damaged or incomplete, and 2 if it could not be converted.
     """
     from skinnode.config import load_hand
     from skinnode.record.convert import convert as run

@@ -1,4 +1,4 @@
-"""``skinnode view``: shows a hand in three dimensions, in a window, in a browser or in a file."""
+"""``skinnode view``: shows a hand in 3-D in a window or a browser, or saves the drawing to a file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _PORTS = 65_534
 
 
 class _Drawing(NamedTuple):
-    """Options of the drawing."""
+    """Drawing options."""
 
     output: OutputOptions
     rate_hz: float
@@ -86,12 +86,12 @@ def view(
     ] = 10.0,
     seconds: Seconds = None,
 ) -> None:
-    """Show a hand in 3-D: pressed surfaces, shear, contacts with forces, health, events, curves over time.
+    """Show a hand in 3-D: pressed surfaces, shear, contacts and forces, health, events, curves over time.
 
-    The command runs the hand as `skinnode host` does, but waits for missing patches. Without --web and
-    --save, it opens a window and ends when the window is closed. With --replay and --save alone, it converts
-    the whole recording as fast as possible. Requires the optional packages of the extra `view`. The exit
-    status is 0 if no fault occurred, 1 if any fault occurred (faults are printed at the end), 2 if the
+    The command runs the hand like `skinnode host`, but waits for missing patches. With neither --web nor
+    --save, it opens a window and ends when the window is closed. With only --replay and --save, it converts
+    the whole recording as fast as possible. Requires the optional packages of the `view` extra. The exit
+    status is 0 if no fault occurred, 1 if any fault occurred (faults are printed at the end), and 2 if the
     command could not run.
     """
     from skinnode.errors import ConfigError
@@ -141,7 +141,7 @@ def _require_viewer() -> None:
 
 
 def _open(stack: ExitStack, options: OutputOptions) -> Output:
-    """Open the output before the hand, so that a port in use is reported at once."""
+    """Open the output; called before the hand is opened, so a port in use is reported immediately."""
     from skinnode.view.outputs import open_output
 
     output = stack.enter_context(open_output(options))
@@ -153,7 +153,7 @@ def _open(stack: ExitStack, options: OutputOptions) -> Output:
 def _live(
     stack: ExitStack, plan: HandConfig, drawing: _Drawing, stop: threading.Event, *, simulate: bool
 ) -> tuple[Output, DrawingProcess, Source]:
-    """Open the output and the drawing, then run the hand; return all three."""
+    """Open the output, start the drawing process and run the hand; return all three."""
     import time
 
     from skinnode.cli._console import progress
@@ -167,7 +167,7 @@ def _live(
 def _replaying(
     stack: ExitStack, path: Path, speed: float, drawing: _Drawing
 ) -> tuple[Output, DrawingProcess, Source]:
-    """Open a recording, the output and the drawing, then play the recording; return the last three."""
+    """Open the output, start the drawing process and play the recording; return all three."""
     from skinnode.monitor.source import ReplaySource
     from skinnode.record import replay
 
@@ -194,7 +194,7 @@ def _show(
     stop: threading.Event,
     drawing: _Drawing,
 ) -> tuple[list[str], DrawnCounts]:
-    """Draw a source until the user ends it; return the faults and the counts of the fields."""
+    """Draw a source until the drawing ends; return the faults and the field counts."""
     from skinnode.view.drawing_thread import DrawingThread
 
     with DrawingThread(source, process.draw, rate_hz=drawing.rate_hz) as thread:
@@ -209,7 +209,7 @@ def _show(
 def _wait(
     source: Source, output: Output, thread: DrawingThread, stop: threading.Event, seconds: float | None
 ) -> None:
-    """Wait until the user, the time limit, the viewer or the end of the recording ends the drawing."""
+    """Wait until the user, the time limit, the viewer, an error or the recording's end ends the drawing."""
     import time
 
     end_s = None if seconds is None else time.monotonic() + seconds
@@ -237,7 +237,7 @@ def _viewer_ended(viewer: ViewerProcess) -> SkinError:
 def _convert(
     stack: ExitStack, path: Path, options: OutputOptions, stop: threading.Event, exaggeration: float
 ) -> tuple[list[str], DrawnCounts]:
-    """Write a whole recording to a file; return its faults and the counts of the fields."""
+    """Write a whole recording to a file; return its faults and the field counts."""
     from skinnode.view.conversion import Conversion
     from skinnode.view.drawing import HandDrawing
     from skinnode.view.outputs import require_new_file

@@ -1,4 +1,4 @@
-"""Onsets and releases of touches, noted by the workers and published as events by the health watch."""
+"""Touch onsets and releases, recorded by the workers and published as events by the health watch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 from skinnode.model.frames import FieldFrame
 
 KEPT: Final = 4096
-"""Maximum number of changes that wait to be published; the oldest are dropped."""
+"""Maximum number of changes queued for publication; when full, the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,22 +19,22 @@ class TouchChange:
 
     patch: str
     t_ns: int
-    """Monotonic time of the scan that showed the change, ns: of its SYNC, or of its last frame if the SYNC is
-    unknown."""
+    """Monotonic time of the scan that showed the change, ns: the SYNC time or, if unknown, the time of the
+    last frame."""
     scan: int
     """Number of this scan."""
     touched: bool
     seconds: float | None
-    """Duration of the touch that has ended, s; None for an onset."""
+    """Duration of the touch that ended, s; None for an onset."""
 
     @property
     def what(self) -> str:
-        """Type of the event: ``touched`` or ``released``."""
+        """Event type: ``touched`` or ``released``."""
         return "touched" if self.touched else "released"
 
     @property
     def text(self) -> str:
-        """Description of the change, without the patch."""
+        """Description of the change, without the patch name."""
         if self.seconds is None:
             return f"touched since scan {self.scan}"
         return f"released in scan {self.scan}, after {self.seconds:.2f} s"
@@ -43,15 +43,15 @@ class TouchChange:
 class TouchChanges:
     """Changes of ``touched`` in the fields of all patches.
 
-    Threads: only the worker that processes a patch may pass its fields. Any thread may take the changes.
+    Threads: only the worker that processes a patch may pass in its fields. Any thread may take the changes.
     """
 
     def __init__(self) -> None:
-        self._since_ns: dict[str, int] = {}  # onset of the present touch of each touched patch
+        self._since_ns: dict[str, int] = {}  # onset of each touched patch's current touch
         self._waiting: deque[TouchChange] = deque(maxlen=KEPT)
 
     def on_field(self, field: FieldFrame, patch: str) -> None:
-        """Compare a field with the one before it. A field without a decision changes nothing."""
+        """Compare a field with the previous field. A field without a touch decision changes nothing."""
         stamp, touched = field.stamp, field.touched
         if stamp is None or touched is None or touched == (patch in self._since_ns):
             return

@@ -1,10 +1,10 @@
 """ROS 2 messages of a hand: standard messages where one exists, and ``skinnode_msgs`` for the rest.
 
 ``definitions`` contains the message definitions that rosbags does not include. ``typestore`` encodes and
-decodes messages as CDR with rosbags, an optional dependency. Each of the other modules converts data of the
-host: ``can_frames`` raw CAN frames, ``fields`` displacement fields, ``contacts`` contacts and their wrenches,
-``health`` health and events, and ``poses`` the poses of patches and links. ``topics`` names topics and
-coordinate frames.
+decodes messages as CDR with rosbags, an optional dependency. Each other module converts one kind of host
+data: ``can_frames`` converts raw CAN frames, ``fields`` displacement fields, ``contacts`` contacts and their
+wrenches, ``health`` health and events, and ``poses`` the poses of patches and links. ``topics`` names topics
+and coordinate frames.
 
 ==============================  =================================================================
 data                            message

@@ -1,8 +1,8 @@
 """Converts CAN frames to ``can_msgs/Frame`` or ``ros2_socketcan_msgs/FdFrame``, and back.
 
-All frames of a bus have the same name of a coordinate frame, so their messages differ only in numbers at
-fixed places. rosbags encodes one message of each length; :class:`FrameEncoder` copies that message and
-replaces the numbers, which takes a tenth of the time.
+All messages of a bus have the same ``frame_id``, so they differ only in numbers at fixed positions. rosbags
+encodes one message of each length; :class:`FrameEncoder` copies that message and replaces the numbers, which
+is ten times faster.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _TIME = struct.Struct("<iI")
 _CLASSIC = struct.Struct("<I???B")
 _FD = struct.Struct("<I??B")
 _AFTER_TIME = 12
-"""Offset of the name of the coordinate frame in a message that begins with a header, bytes: four bytes of
-encapsulation and eight bytes of time precede it."""
+"""Offset of ``frame_id`` in a message that begins with a header, bytes: four bytes of encapsulation and eight
+bytes of time precede it."""
 _CLASSIC_BYTES = 8
 
 
 def frame_message(frame: Frame, frame_id: str) -> tuple[str, Any]:
-    """Return the name of the message for a CAN frame, and the message.
+    """Return the message name for a CAN frame, and the message.
 
     Args:
         frame: The frame; ``t_ns`` is a time since 1970.
@@ -44,7 +44,7 @@ def frame_message(frame: Frame, frame_id: str) -> tuple[str, Any]:
 
 
 class FrameEncoder:
-    """Encoder of the frames of one bus as CDR; the bytes equal those of rosbags.
+    """Encodes the frames of one bus as CDR; the bytes are identical to those from rosbags.
 
     Args:
         frame_id: Value of ``frame_id`` in the header: the name of the bus.
@@ -54,10 +54,11 @@ class FrameEncoder:
         self._frame_id = frame_id
         self._templates: dict[tuple[bool, int], bytes] = {}
         self._numbers = -(-(_AFTER_TIME + 4 + len(frame_id.encode()) + 1) // 4) * 4
-        """Offset of the identifier, which follows the name with its length and final zero, aligned to 4."""
+        """Offset of the CAN identifier, bytes. ``frame_id``, with its length and final zero, precedes it; the
+        offset is a multiple of 4."""
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the encoded frame; ``t_ns`` of the frame is a time since 1970."""
+        """Return the encoded frame; the frame's ``t_ns`` is a time since 1970."""
         data = frame.data
         template = self._templates.get((frame.fd, len(data)))
         if template is None:
@@ -76,7 +77,7 @@ class FrameEncoder:
 
 
 def frame_of(data: bytes, name: str) -> Frame:
-    """Return the CAN frame of an encoded message; ``t_ns`` is a time since 1970.
+    """Return the CAN frame from an encoded message; the frame's ``t_ns`` is a time since 1970.
 
     Args:
         data: Message as CDR.

@@ -17,11 +17,11 @@ WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 
 
 def contacts_message(field: FieldFrame, t_ns: int) -> Any:
-    """Return all contacts of a field as ``skinnode_msgs/Contacts``, in the frame of the patch.
+    """Return a field's contacts as ``skinnode_msgs/Contacts``, in the patch frame.
 
     Args:
         field: The field, with a stamp.
-        t_ns: Time of the measurement since 1970, ns.
+        t_ns: Measurement time since 1970, ns.
     """
     stamp = field.stamp
     assert stamp is not None
@@ -35,14 +35,14 @@ def contacts_message(field: FieldFrame, t_ns: int) -> Any:
 
 
 def contact_wrenches(field: FieldFrame, t_ns: int) -> list[Any]:
-    """Return the wrench of each contact as ``geometry_msgs/WrenchStamped``, strongest contact first.
+    """Return each contact's wrench as ``geometry_msgs/WrenchStamped``, strongest contact first.
 
-    The force acts on the skin. The torque is taken about the origin of the patch's frame: it is the cross
+    The force acts on the skin. The torque is taken about the origin of the patch frame: it is the cross
     product of the contact's position and force.
 
     Args:
         field: The field, with a stamp.
-        t_ns: Time of the measurement since 1970, ns.
+        t_ns: Measurement time since 1970, ns.
     """
     stamp = field.stamp
     assert stamp is not None
@@ -57,7 +57,7 @@ def contact_wrenches(field: FieldFrame, t_ns: int) -> list[Any]:
 
 
 def on_patch(contact: Contact, field: FieldFrame) -> HandContact:
-    """Return a contact of a field with its force as a vector in the frame of the patch."""
+    """Return a field's contact with its force as a vector in the patch frame."""
     assert field.stamp is not None
     return HandContact.on_link(contact, field.stamp.patch, Mount(), trusted=field.trusted)
 

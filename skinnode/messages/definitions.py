@@ -1,7 +1,7 @@
-"""Definitions of the messages that rosbags does not include, in the format ``ros2msg``.
+"""Definitions, in ``ros2msg`` format, of the messages that rosbags does not include.
 
 ``can_msgs/Frame`` is defined by ros_canopen and ``ros2_socketcan_msgs/FdFrame`` by ros2_socketcan. The
-messages ``skinnode_msgs`` are our own. Their constant ``VERSION`` increases with every change; a reader
+``skinnode_msgs`` messages are our own. Their ``VERSION`` constant increases with every change; a reader
 refuses a newer version.
 """
 
@@ -11,7 +11,7 @@ import re
 from typing import Final
 
 OURS: Final = "skinnode_msgs/"
-"""Prefix of the names of our own messages."""
+"""Name prefix of our own messages."""
 
 CAN_FRAME: Final = "can_msgs/msg/Frame"
 FD_FRAME: Final = "ros2_socketcan_msgs/msg/FdFrame"
@@ -115,6 +115,6 @@ _VERSION: Final = re.compile(r"^uint16 VERSION\s*=\s*(\d{1,5})\b", re.MULTILINE)
 
 
 def version_of(definition: str) -> int | None:
-    """Return the constant ``VERSION`` of a message definition; None if there is none."""
+    """Return the ``VERSION`` constant of a message definition; None if the definition has none."""
     match = _VERSION.search(definition)
     return None if match is None else int(match[1])

@@ -20,10 +20,10 @@ CLOUD_FIELDS: Final = (
     *("x", "y", "z", "dx", "dy", "dz", "std_x", "std_y", "std_z"),
     *("fx", "fy", "fz", "share_x", "share_y", "share_z"),
 )
-"""Fields of a point: displaced position (m) in the frame of the patch, displacement (m) and its standard
-deviation (m; infinite where unknown), force on the skin (N; NaN without forces), and the fraction of the
-displacement that the data determine. The points are in the order of the upper wires and, within a wire, of
-its electrodes."""
+"""Fields of a point: displaced position (m) in the patch frame, displacement (m) and its standard deviation
+(m; infinite where unknown), force on the skin (N; NaN if no forces were computed), and the fraction of the
+displacement that is determined by the data. The points are ordered by upper wire and, within a wire, by
+electrode."""
 
 _FLOAT32: Final = 7
 """Value of ``PointField.FLOAT32``."""
@@ -34,8 +34,8 @@ def point_cloud(field: FieldFrame, rest_m: Float, t_ns: int) -> Any:
 
     Args:
         field: The field, with a stamp.
-        rest_m: (U, N, 3) positions of the electrodes at rest, metres.
-        t_ns: Time of the measurement since 1970, ns.
+        rest_m: (U, N, 3) electrode positions at rest, m.
+        t_ns: Measurement time since 1970, ns.
     """
     assert field.stamp is not None
     shape = field.displacement_m.shape
@@ -60,11 +60,11 @@ def point_cloud(field: FieldFrame, rest_m: Float, t_ns: int) -> Any:
 
 
 def field_info(field: FieldFrame, t_ns: int) -> Any:
-    """Return the data of a field that a point cloud cannot contain, as ``skinnode_msgs/FieldInfo``.
+    """Return a field's data that a point cloud cannot contain, as ``skinnode_msgs/FieldInfo``.
 
     Args:
         field: The field, with a stamp.
-        t_ns: Time of the measurement since 1970, ns.
+        t_ns: Measurement time since 1970, ns.
     """
     stamp, stats = field.stamp, field.stats
     assert stamp is not None

@@ -25,7 +25,7 @@ _LEVEL: Final = {
     Condition.NEVER_SEEN: STALE,
     Condition.LOST: STALE,
 }
-"""Level of each condition; every other condition is an error."""
+"""Diagnostic level of each condition; every other condition is an error."""
 _INFO, _WARN = 20, 30
 """Levels of ``rcl_interfaces/Log``."""
 
@@ -33,7 +33,7 @@ _INFO, _WARN = 20, 30
 def diagnostics(
     hand: str, patches: Mapping[str, PatchHealth], buses: Mapping[str, BusHealth], t_ns: int
 ) -> Any:
-    """Return the health of a hand as ``diagnostic_msgs/DiagnosticArray``, one status per patch and bus.
+    """Return a hand's health as ``diagnostic_msgs/DiagnosticArray``, with one status per patch and per bus.
 
     Args:
         hand: Name of the hand.
@@ -66,17 +66,17 @@ def diagnostics(
 
 
 def level_of(health: PatchHealth) -> int:
-    """Return the diagnostic level of a patch; an operational patch with faulty wires or readings is WARN."""
+    """Return a patch's diagnostic level; WARN for an operational patch with faulty wires or readings."""
     level = _LEVEL.get(health.condition, ERROR)
     return WARN if level == OK and (health.wires or health.faults or health.life) else level
 
 
 def log_message(event: HealthEvent, t_ns: int) -> Any:
-    """Return an event as ``rcl_interfaces/Log``: its subject as name, and its type as function.
+    """Return an event as ``rcl_interfaces/Log``, with its subject as ``name`` and its type as ``function``.
 
     Args:
         event: The event.
-        t_ns: Time of the event since 1970, ns.
+        t_ns: Event time since 1970, ns.
     """
     level = _INFO if event.what in (Condition.OPERATIONAL, Condition.BOOTING, "baselines") else _WARN
     return message_type(LOG)(time_of(t_ns), level, event.subject, event.text, "skinnode", event.what, 0)
@@ -87,7 +87,7 @@ def _joined(condition: str, reason: str) -> str:
 
 
 def _values(health: PatchHealth | BusHealth) -> list[Any]:
-    """Return every value that is known, as text."""
+    """Return all known values as text."""
     make = message_type("diagnostic_msgs/msg/KeyValue")
     values = ((entry.name, getattr(health, entry.name)) for entry in dataclasses.fields(health))
     return [make(name, _text(value)) for name, value in values if value is not None]

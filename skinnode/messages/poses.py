@@ -1,4 +1,4 @@
-"""Converts the poses of patches and links to ``tf2_msgs/TFMessage``."""
+"""Converts patch and link poses to ``tf2_msgs/TFMessage``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 
 
 def transforms(skeleton: Skeleton, t_ns: int) -> Any:
-    """Return the poses of all patches on their links, and of all links in the hand.
+    """Return all patch poses on their links, and all link poses in the hand.
 
     Args:
-        skeleton: The poses.
+        skeleton: Patch and link poses.
         t_ns: Time since 1970, ns.
     """
     poses = [_transform(HAND, link, pose, t_ns) for link, pose in skeleton.link_poses.items() if link != HAND]

@@ -1,7 +1,7 @@
 """Names the ROS 2 topics of a hand and the coordinate frames of its patches.
 
-A name in ROS 2 contains only letters, digits and underscores. Other characters of the names in the hand file
-become underscores.
+A ROS 2 name contains only letters, digits and underscores. Any other character of a name in the hand file
+becomes an underscore.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class PatchTopics(NamedTuple):
 
 
 class BusTopics(NamedTuple):
-    """Topics of a bus, named as by ros2_socketcan."""
+    """Topics of a bus, with the names that ros2_socketcan uses."""
 
     received: str
     sent: str
@@ -70,10 +70,10 @@ class HandTopics:
 
 
 def patch_frame(patch: str) -> str:
-    """Return the name of the coordinate frame of a patch.
+    """Return the name of a patch's coordinate frame.
 
-    The prefix distinguishes a patch from a link of the same name. Links keep their names, and the hand is
-    ``hand``.
+    The prefix distinguishes a patch from a link with the same name. Links keep their names, and the hand's
+    frame is ``hand``.
     """
     return f"skin/{patch}"
 

@@ -1,4 +1,4 @@
-"""Encodes and decodes ROS 2 messages as CDR. rosbags does the encoding; it is an optional dependency."""
+"""Encodes and decodes ROS 2 messages as CDR, using rosbags, an optional dependency."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _LATEST_NS: Final = 2**31 * 1_000_000_000 - 1
 
 
 def require_mcap(option: str) -> None:
-    """Check that the packages of the extra ``mcap`` are installed.
+    """Check that the packages for the ``mcap`` extra are installed.
 
     Args:
-        option: Option or file that needs the packages, for the error message.
+        option: Option or file that requires the packages; used in the error message.
 
     Raises:
         ConfigError: A package is missing.
@@ -32,7 +32,7 @@ def require_mcap(option: str) -> None:
 
 @functools.cache
 def typestore() -> Typestore:
-    """Return the rosbags typestore with the standard messages of ROS 2 Humble and our own messages."""
+    """Return the rosbags typestore with the ROS 2 Humble standard messages and our own messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -44,7 +44,7 @@ def typestore() -> Typestore:
 
 
 def message_type(name: str) -> Any:
-    """Return the class of a message such as ``std_msgs/msg/Header``."""
+    """Return the class for a message name such as ``std_msgs/msg/Header``."""
     return typestore().types[name]
 
 
@@ -74,24 +74,24 @@ def decode(data: bytes, name: str) -> Any:
 
 @functools.cache
 def schema_text(name: str) -> str:
-    """Return the definition of a message and of all messages that it contains, in the format ``ros2msg``."""
+    """Return a message definition, including all nested messages, in ``ros2msg`` format."""
     text, _ = typestore().generate_msgdef(name, ros_version=2)
     return text
 
 
 def seconds_and_ns(t_ns: int) -> tuple[int, int]:
-    """Split a time since 1970, ns, into the fields of ``builtin_interfaces/Time``.
+    """Split a time since 1970 (ns) into the fields of ``builtin_interfaces/Time``.
 
-    A time before 1970 or after 2038, which the message cannot hold, becomes the nearest possible time.
+    A time before 1970 or after 2038, which the message cannot hold, is clamped to the nearest possible time.
     """
     return divmod(min(max(t_ns, 0), _LATEST_NS), 1_000_000_000)
 
 
 def time_of(t_ns: int) -> Any:
-    """Return a ``builtin_interfaces/Time`` for a time since 1970, ns."""
+    """Return a ``builtin_interfaces/Time`` for a time since 1970 (ns)."""
     return message_type("builtin_interfaces/msg/Time")(*seconds_and_ns(t_ns))
 
 
 def header(t_ns: int, frame_id: str) -> Any:
-    """Return a ``std_msgs/Header`` with a time since 1970, ns, and the name of a coordinate frame."""
+    """Return a ``std_msgs/Header`` with a time since 1970 (ns) and a coordinate-frame name."""
     return message_type("std_msgs/msg/Header")(time_of(t_ns), frame_id)

@@ -1,9 +1,8 @@
-"""Converts recordings between file formats, and computes tables of fields from them.
+"""Converts recordings between file formats, and computes field tables from them.
 
-The suffixes of the files determine the formats. A conversion between two files with frames copies every frame
-and the journal, so a replay of the result computes the same fields. An MCAP file also gets the fields,
-contacts and poses, which a replay computes. A table of fields contains what a replay computes, with the
-resistances.
+The file suffixes determine the formats. A conversion between two files with frames copies every frame and the
+journal, so a replay of the result computes the same fields. An MCAP target also receives the fields, contacts
+and poses, which a replay computes. A field table contains the results of a replay and the resistances.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ TABLES: Final = (PARQUET, NPZ)
 TARGETS: Final = (*FRAME_FILES, *TABLES)
 
 _FLUSH_FRAMES: Final = 5_000
-"""Number of frames between two flushes. A BLF container between two flushes must not overflow."""
+"""Number of frames between two flushes. A BLF container must not overflow between two flushes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +45,13 @@ class Conversion:
     fields: int
     """Number of fields written."""
     faults: tuple[str, ...]
-    """Missing or unreadable parts of the source."""
+    """Messages about missing or unreadable parts of the source."""
     notes: tuple[str, ...]
-    """Data that the target cannot contain, and assumptions."""
+    """Messages about assumptions, and about data that the target cannot contain."""
 
 
 class FieldTable(Protocol):
-    """New table of fields."""
+    """New field table."""
 
     def write(self, row: FieldRow) -> None:
         """Write a row."""
@@ -64,17 +63,17 @@ class FieldTable(Protocol):
 def convert(
     source: Path, target: Path, *, hand: HandConfig | None = None, frames_only: bool = False
 ) -> Conversion:
-    """Convert a recording or a table of fields. If the conversion fails, the target is deleted.
+    """Convert a recording or a field table. If the conversion fails, the target is deleted.
 
     Args:
         source: Existing file.
         target: New file.
         hand: Hand for a log without a journal; see :func:`skinnode.record.sources.open_log`.
-        frames_only: Whether to leave the fields out of an MCAP file.
+        frames_only: Whether to omit the fields from an MCAP file.
 
     Raises:
-        ConfigError: The source cannot be read, the target exists or cannot be written, there is no such
-            conversion, or the packages for a format are not installed.
+        ConfigError: The source cannot be read, the target exists or cannot be written, the conversion is not
+            supported, or the packages for a format are not installed.
     """
     taken = _check(source, target, hand)
     try:
@@ -94,7 +93,7 @@ def convert(
 
 
 def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
-    """Return the files to create. Raises ConfigError if there is no such conversion, or if a file exists."""
+    """Return the files to create. Raises ConfigError if the conversion is unsupported or a file exists."""
     if source.suffix not in TARGETS:
         raise ConfigError("source", str(source), _ending_in(TARGETS))
     allowed = TABLES if source.suffix in TABLES else TARGETS
@@ -115,7 +114,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
 
 
 def _share_journal(source: Path, target: Path) -> bool:
-    """Return whether both files are logs of the same name in the same folder, which have the same journal."""
+    """Return whether both files are logs with the same name in the same folder and so share a journal."""
     return {source.suffix, target.suffix} <= set(WRITABLE) and source.with_suffix("") == target.with_suffix(
         ""
     )
@@ -207,7 +206,7 @@ def _write_field(file: McapFile, run: Replay, field: FieldFrame) -> None:
 
 
 class _Tee:
-    """Frames of a recording, which are written to a file while they are read."""
+    """Writes a recording's frames to a file while they are read."""
 
     def __init__(self, recording: OpenRecording, file: LogFiles | McapFile) -> None:
         self._frames, self._file, self._channels = recording.frames, file, recording.channels
@@ -238,7 +237,7 @@ class _Tee:
 
 
 def _losses(recording: OpenRecording, target: Path, tee: _Tee) -> list[str]:
-    """Describe what the target cannot contain, in at most one line."""
+    """Describe, in at most one line, the data that the target cannot contain."""
     lost = []
     from_mcap = recording.frames.path.suffix == MCAP
     if from_mcap and target.suffix != MCAP:

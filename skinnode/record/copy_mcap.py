@@ -12,10 +12,10 @@ from skinnode.transport.frame_log import create_binary
 
 
 def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
-    """Copy every readable message with its times, topic and schema.
+    """Copy every readable message, with its times, topic and schema.
 
     Returns:
-        Numbers of CAN frames and of fields copied, and a one-line message for each damaged part.
+        Numbers of CAN frames and fields copied, and a one-line message for each damaged part.
 
     Raises:
         ConfigError: The source is not an MCAP file, or the target cannot be created.

@@ -1,8 +1,8 @@
-"""Converts fields to rows of a table: one row per field, every value an array or number without gaps.
+"""Converts fields to table rows: one row per field; no value is missing.
 
-A value that a field lacks has a replacement, so that the formats need no missing values: NaN for an unknown
-number, False for an unknown mask, 1 for an unknown share of the data, and ``displacement_std_m`` for an
-unknown ``core_std_m``. The column ``tested`` shows whether ``wires_trusted`` is known.
+Values that a field lacks are filled in: NaN for an unknown number, False for an unknown mask, 1 for an
+unknown data share, and ``displacement_std_m`` for an unknown ``core_std_m``. The column ``tested`` shows
+whether ``wires_trusted`` is known.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skinnode.model.frames import FieldFrame, ResistanceFrame
 
 FORMAT: Final = "skinnode fields 1"
-"""Format and version of a table of fields, which every file contains."""
+"""Format and version of a field table; stored in every file."""
 PREFIX: Final = "skinnode fields "
 
 NUMBERS: Final = {
@@ -31,8 +31,8 @@ NUMBERS: Final = {
     "precise": "|b1",
     "noise_factor": "<f8",
 }
-"""Columns with one number per field, and their types. ``time_ns`` is the time of the SYNC, or of the last
-frame if the SYNC is unknown, in ns since 1970. The other times are on the host's monotonic clock."""
+"""Columns with one number per field, and their types. ``time_ns`` is the time of the SYNC or, if the SYNC is
+unknown, of the last frame, in ns since 1970. The other times are on the host's monotonic clock."""
 TEXTS: Final = ("method", "distrust")
 """Columns with one text per field."""
 WIRES: Final = {
@@ -43,18 +43,18 @@ WIRES: Final = {
     "held": "|b1",
     "gain": "<f8",
 }
-"""Columns with one value per upper wire, (U,)."""
+"""(U,): columns with one value per upper wire, and their types."""
 POINTS: Final = ("displacement_m", "displacement_std_m", "core_std_m", "data_share", "force_n")
-"""Columns with one vector per electrode, (U, N, 3) float64."""
+"""(U, N, 3) float64: columns with one vector per electrode."""
 CROSSINGS: Final = ("resistance_ohm",)
-"""Columns with one value per crossing, (U, K) float64; NaN where the value was not used."""
+"""(U, K) float64: columns with one value per crossing; NaN where the value was not used."""
 
 Columns = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class FieldRow:
-    """Row of a table of fields."""
+    """Row of a field table."""
 
     patch: str
     columns: Columns
@@ -63,16 +63,16 @@ class FieldRow:
     contacts: list[Columns] | None = None
     """Contacts; None if unknown."""
     faults: list[Columns] | None = None
-    """Faults in the data; None if unknown."""
+    """Data faults; None if unknown."""
 
 
 def row_of(field: FieldFrame, resistance: ResistanceFrame, offset_ns: int) -> FieldRow:
-    """Return a field as a row.
+    """Return a field as a table row.
 
     Args:
         field: The field, with a stamp.
         resistance: Resistances from which the field was computed.
-        offset_ns: Difference between the time since 1970 and the clock of the stamp, ns.
+        offset_ns: Time since 1970 minus time on the stamp's clock, ns.
     """
     stamp, shape = field.stamp, field.displacement_m.shape
     assert stamp is not None

@@ -13,9 +13,9 @@ from skinnode.transport.frame_log import FrameLog, LoggedFrame, create
 
 
 class LogFiles:
-    """Log and journal of a recording. Only one thread may write.
+    """Log and journal of a recording. Only one thread may write to it.
 
-    All methods that write raise OSError if writing fails.
+    All write methods raise OSError if writing fails.
 
     Args:
         path: Path of the new log.
@@ -45,16 +45,16 @@ class LogFiles:
         return self._log.frames
 
     def write(self, bus: str, frame: Frame, *, sent: bool, log_ns: int) -> None:
-        """Write a frame. Its ``t_ns`` is a time since 1970; the format has no place for ``log_ns``."""
+        """Write a frame. Its ``t_ns`` is a time since 1970; the format cannot store ``log_ns``."""
         self._log.write(LoggedFrame(frame, self._channels[bus], sent))
 
     def write_line(self, line: str, log_ns: int) -> None:
-        """Write a line of the journal."""
+        """Write a journal line."""
         if self._journal is not None:
             self._journal.write(line + "\n")
 
     def flush(self, *, to_disk: bool) -> None:
-        """Flush the journal and then the log, so that the journal on disk is never the older of the two."""
+        """Flush the journal before the log, so the journal on disk is never older than the log."""
         if self._journal is not None:
             self._journal.flush()
         self._log.flush(to_disk=to_disk)
@@ -65,7 +65,7 @@ class LogFiles:
             self._journal.flush()
 
     def close(self) -> None:
-        """Close the files. Disk errors are ignored here, because earlier calls have reported them."""
+        """Close the files. Ignores disk errors, because earlier calls have reported them."""
         if self._journal is not None:
             with contextlib.suppress(OSError):
                 self._journal.close()
@@ -79,7 +79,7 @@ class LogFiles:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return the channel of each bus in the log: its name if candump accepts it, otherwise bus0, bus1, …."""
+    """Return each bus's channel in the log: the bus name if candump accepts it, otherwise bus0, bus1, …."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

@@ -1,7 +1,7 @@
-"""Reads the messages of an MCAP file chunk by chunk, even if the file is damaged or lacks its end.
+"""Reads the messages of an MCAP file chunk by chunk, even if the file is damaged or truncated.
 
-The library's own readers stop at the first damaged record. This reader skips damaged parts, and records where
-they are. The library parses the records and checks the checksum of each chunk.
+The library's own readers stop at the first damaged record. This reader skips damaged parts and records their
+positions. The library parses the records and verifies each chunk's checksum.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from skinnode.transport.frame_log_reader import DAMAGES_KEPT, Damage
 MAGIC: Final = b"\x89MCAP0\r\n"
 
 _HEAD: Final = struct.Struct("<BQ")  # opcode and length of each record
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # of a chunk: two times, size, checksum, length of the next word
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # two times, size, checksum, length of the next word
 _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _MOST_CHUNK: Final = 1 << 26
-"""Maximum size of a chunk before compression, bytes; usually 1 MiB. Larger sizes are due to damage."""
+"""Maximum uncompressed chunk size, bytes; the usual size is 1 MiB. A larger size indicates damage."""
 _AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
 
 
 @dataclass(frozen=True, slots=True)
 class McapMessage:
-    """Message of an MCAP file with its channel and its schema, None if the message has no schema."""
+    """MCAP message with its channel and schema; the schema is None if the message has none."""
 
     message: Message
     channel: Channel
     schema: Schema | None
     offset: int
-    """Offset of the chunk in the file, bytes."""
+    """Offset of the message's chunk in the file, bytes."""
 
 
 class McapChunks:
-    """Messages of an MCAP file in the order of the file, which is open only while it is read.
+    """Messages of an MCAP file, in file order. The file is open only while it is being read.
 
     Args:
         path: The file.
-        check: Function called with each schema that is read; its exceptions are propagated.
+        check: Function called with each schema read; its exceptions propagate to the caller.
 
     Raises:
         ConfigError: The file cannot be read or is not an MCAP file.
@@ -63,12 +63,12 @@ class McapChunks:
         """Number of damaged parts found so far."""
 
     def messages(self, names: Collection[str] | None, *, by_index: bool = False) -> Iterator[McapMessage]:
-        """Yield the messages with some schemas.
+        """Yield the messages that have one of the given schemas.
 
         Args:
-            names: Names of the schemas; None for all messages.
-            by_index: Whether to skip chunks that contain no such message according to their index. This
-                requires that the first message on each topic is in the chunk that defines the topic.
+            names: Schema names; None for all messages.
+            by_index: Whether to skip chunks whose index lists no such message. The first message on each
+                topic must then be in the chunk that defines the topic.
         """
 
         def wanted(channel: int) -> bool:
@@ -100,10 +100,10 @@ class McapChunks:
     def _records(
         self, data: mmap.mmap, wanted: Callable[[int], bool] | None
     ) -> Iterator[tuple[int, McapRecord]]:
-        """Yield the records of all chunks, each with the offset of its chunk.
+        """Yield the records in all chunks, each with its chunk's offset.
 
-        A damaged length may point beyond intact chunks. A chunk whose checksum is right has the right length.
-        After any other record, the next record must be plausible, or no intact chunk may follow.
+        A damaged length may point beyond intact chunks. If a chunk's checksum is correct, so is its length.
+        The length of any other record is accepted if the next record is plausible or no intact chunk follows.
         """
         at, size = len(MAGIC), len(data)
         while at < size:
@@ -128,12 +128,12 @@ class McapChunks:
                 at = end
                 continue
             following = _find_chunk(data, at + 1)
-            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage has been recorded
+            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage is already recorded
                 self.complain(at, "truncated" if following == size else "no record")
             at = following
 
     def _read(self, data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:
-        """Return the records in a chunk, or a record that is not in a chunk; None if it cannot be read."""
+        """Return the records in a chunk, or a single record outside a chunk; None if it cannot be read."""
         try:
             record = _parsed(data[at], data[at + _HEAD.size : end])
             if not isinstance(record, Chunk):
@@ -188,12 +188,12 @@ def _end_of(data: mmap.mmap, at: int) -> int | None:
 
 
 def _is_plausible(data: mmap.mmap, at: int) -> bool:
-    """Return whether the file ends at ``at``, or a complete record begins there."""
+    """Return whether the file ends or a complete record begins at ``at``."""
     return at == len(data) or _end_of(data, at) is not None
 
 
 def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:
-    """Return the numbers of the channels in the message indexes after a chunk; None if there are none."""
+    """Return the channel numbers in the message indexes after a chunk; None if there are no indexes."""
     found = set()
     while (end := _end_of(data, at)) is not None and data[at] == Opcode.MESSAGE_INDEX:
         if end < at + _HEAD.size + 2:
@@ -204,7 +204,7 @@ def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:
 
 
 def _find_chunk(data: mmap.mmap, at: int) -> int:
-    """Return the offset of the next complete chunk; the length of the file if there is none."""
+    """Return the offset of the next complete chunk, or the file length if there is none."""
     while (at := data.find(bytes([Opcode.CHUNK]), at)) >= 0:
         end = _end_of(data, at)
         if end is not None and end >= at + _HEAD.size + _CHUNK_HEAD.size:
@@ -217,7 +217,7 @@ def _find_chunk(data: mmap.mmap, at: int) -> int:
 
 
 def _decompressed(chunk: Chunk) -> Chunk:
-    """Return the chunk without compression. Raises ValueError if it would be larger than it claims."""
+    """Decompress a chunk. Raises ValueError if its content would be larger than its stated size."""
     size, data = chunk.uncompressed_size, chunk.data
     if size > _MOST_CHUNK:
         raise ValueError(f"{size} bytes, must be at most {_MOST_CHUNK}")

@@ -1,11 +1,11 @@
-"""Writes a recording as one MCAP file: frames, journal, fields, contacts, health and events.
+"""Writes a recording to a single MCAP file: frames, journal, fields, contacts, health and events.
 
-The file consists of chunks. Each :meth:`McapFile.flush` ends a chunk and passes it to the operating system,
-so a file whose process was killed contains every chunk up to the last flush. Such a file lacks only the index
-at its end.
+The file consists of chunks. Each :meth:`McapFile.flush` ends a chunk and passes it to the operating system.
+If the process is killed, the file contains every chunk up to the last flush and lacks only the index at its
+end.
 
-The log time of a message is the time at which the recorder received it. The publish time of a frame is the
-time of its arrival, and that of a field the time at which it was solved.
+A message's log time is the time at which the recorder received it. A frame's publish time is its arrival
+time; a field's publish time is the time at which it was solved.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 MCAP: Final = ".mcap"
 PROFILE: Final = "ros2"
 BUS_KEY: Final = "skinnode.bus"
-"""Key of a channel's metadata: name of the bus whose frames the channel contains."""
+"""Channel metadata key: name of the bus whose frames the channel contains."""
 SENT_KEY: Final = "skinnode.sent"
-"""Key of a channel's metadata: ``1`` if the host sent the frames of the channel, otherwise ``0``."""
+"""Channel metadata key: ``1`` if the host sent the channel's frames, otherwise ``0``."""
 CHUNK_BYTES: Final = 1 << 20
-"""Maximum size of a chunk before compression, bytes."""
+"""Maximum uncompressed chunk size, bytes."""
 
 _LATCHED: Final = """\
 - history: 1
@@ -59,16 +59,16 @@ _LATCHED: Final = """\
 
 
 class McapFile:
-    """MCAP file of a recording. Only one thread may write.
+    """MCAP file of a recording. Only one thread may write to it.
 
-    All methods that write raise OSError if writing fails.
+    All write methods raise OSError if writing fails.
 
     Args:
         path: Path of the new file.
         hand: The hand.
 
     Raises:
-        ConfigError: The file already exists or cannot be created, or a package of the extra mcap is missing.
+        ConfigError: The file already exists or cannot be created, or a package for the mcap extra is missing.
     """
 
     def __init__(self, path: Path, hand: HandConfig) -> None:
@@ -107,7 +107,7 @@ class McapFile:
         self.frames += 1
 
     def write_line(self, line: str, log_ns: int) -> None:
-        """Write a line of the journal."""
+        """Write a journal line."""
         self._write(self._topics.journal, JOURNAL_LINE, message_type(JOURNAL_LINE)(line), log_ns, log_ns)
 
     def write_field(self, field: FieldFrame, rest_m: Float, offset_ns: int, log_ns: int) -> None:
@@ -115,8 +115,8 @@ class McapFile:
 
         Args:
             field: The field, with a stamp.
-            rest_m: (U, N, 3) positions of the electrodes at rest, metres.
-            offset_ns: Difference between the time since 1970 and the clock of the field's stamp, ns.
+            rest_m: (U, N, 3) electrode positions at rest, m.
+            offset_ns: Time since 1970 minus time on the stamp's clock, ns.
             log_ns: Time since 1970 at which the recorder received the field, ns.
         """
         stamp = field.stamp
@@ -140,26 +140,26 @@ class McapFile:
         self._write(TF_STATIC, TRANSFORMS, transforms(self._skeleton, log_ns), log_ns, log_ns)
 
     def write_event(self, event: HealthEvent, offset_ns: int, log_ns: int) -> None:
-        """Write an event; ``offset_ns`` is the difference between the time since 1970 and its clock, ns."""
+        """Write an event; ``offset_ns`` is the time since 1970 minus the time on the event's clock, ns."""
         t_ns = event.t_ns + offset_ns
         self._write(self._topics.events, LOG, log_message(event, t_ns), t_ns, log_ns)
 
     def flush(self, *, to_disk: bool) -> None:
-        """End the chunk and pass it to the operating system, so that it survives the end of the process.
+        """End the chunk and pass it to the operating system; it then survives if the process is killed.
 
         Args:
-            to_disk: Whether to wait until the file is on the disk, so that it survives a power failure.
+            to_disk: Whether to wait until the file is on disk and would survive a power failure.
         """
         self._writer.flush()
         if to_disk:
             os.fsync(self._file.fileno())
 
     def flush_journal(self) -> None:
-        """Flush the journal, with everything written so far."""
+        """Flush the journal and everything else written so far."""
         self.flush(to_disk=False)
 
     def close(self) -> None:
-        """Write the index and close the file. Disk errors are ignored: earlier calls have reported them."""
+        """Write the index and close the file. Ignores disk errors, which earlier calls have reported."""
         with contextlib.suppress(OSError):
             self._writer.finish()
             self._file.flush()

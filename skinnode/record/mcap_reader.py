@@ -1,4 +1,4 @@
-"""Reads the journal and the CAN frames of an MCAP file: a recording, or a ROS 2 bag with CAN frames."""
+"""Reads the journal and CAN frames from an MCAP file: a recording, or a ROS 2 bag with CAN frames."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 
 _RECEIVED_TOPICS = ("from_can_bus", "from_can_bus_fd")
 _SENT_TOPICS = ("to_can_bus", "to_can_bus_fd")
-"""Last part of the topics of ros2_socketcan."""
+"""Last parts of the ros2_socketcan topic names."""
 
 
 class McapReader:
-    """Iterable over the CAN frames of an MCAP file. Frames have the name of their bus as channel.
+    """Iterable over the CAN frames of an MCAP file. A frame's channel is the name of its bus.
 
-    Without the name of a bus, the channel is the namespace of the topics of ros2_socketcan, such as ``can0``
-    of ``/can0/from_can_bus``, or otherwise the topic.
+    If the file does not name the bus, the channel is the namespace of a ros2_socketcan topic, such as
+    ``can0`` in ``/can0/from_can_bus``, or the whole name of any other topic.
 
     Raises:
         ConfigError: The file cannot be read, is not an MCAP file, or contains a newer version of our
-            messages; or a package of the extra mcap is missing.
+            messages; or a package for the mcap extra is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,10 +58,10 @@ class McapReader:
         return self._chunks.damaged
 
     def close(self) -> None:
-        """Do nothing: the file is open only while it is read."""
+        """Do nothing, because the file is open only while it is being read."""
 
     def journal(self) -> Iterator[bytes]:
-        """Yield the lines of the journal."""
+        """Yield the journal lines."""
         for item in self._chunks.messages((JOURNAL_LINE,), by_index=True):
             try:
                 line: str = decode(item.message.data, JOURNAL_LINE).json
@@ -79,7 +79,7 @@ class McapReader:
                 self._chunks.complain(item.offset, f"a message that cannot be read ({error})")
 
     def _check(self, schema: Schema) -> None:
-        """Raise ConfigError if a message of ours has a newer version than this one."""
+        """Raise ConfigError if one of our messages has a newer version than this program knows."""
         if not schema.name.startswith(OURS):
             return
         found = version_of(schema.data.decode("utf-8", "replace"))

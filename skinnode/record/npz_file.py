@@ -1,6 +1,6 @@
-"""Writes and reads tables of fields as NPZ: one array per patch and column, the first axis counts the fields.
+"""Writes and reads field tables as NPZ: one array per patch and column, with the fields along the first axis.
 
-The name of an array is ``PATCH/COLUMN``, such as ``palm/displacement_m`` with shape (T, U, N, 3).
+An array is named ``PATCH/COLUMN``: for example, ``palm/displacement_m`` with shape (T, U, N, 3).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _HAND_NAME: Final = "hand"
 
 
 class NpzFile:
-    """New NPZ file of fields. Rows are kept in temporary files until :meth:`close`, not in memory.
+    """New NPZ field table. Until :meth:`close`, the rows are kept in temporary files, not in memory.
 
     Args:
         path: Path of the new file.
@@ -60,7 +60,7 @@ class NpzFile:
 
 
 class _Rows:
-    """Rows of one patch in a temporary file of records; texts are numbers of entries in a list."""
+    """Rows of one patch in a temporary file of records; each text is stored as an index into a list."""
 
     def __init__(self, path: Path, first: FieldRow) -> None:
         self._path = path
@@ -107,7 +107,7 @@ def _write(members: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
 
 
 def _write_rows(members: zipfile.ZipFile, name: str, column: NDArray[Any]) -> None:
-    """Write an array some rows at a time, because a column may be larger than the memory."""
+    """Write an array in groups of rows, because a column may not fit in memory."""
     with members.open(f"{name}.npy", "w", force_zip64=True) as member:
         head = {
             "descr": np.lib.format.dtype_to_descr(column.dtype),
@@ -120,13 +120,13 @@ def _write_rows(members: zipfile.ZipFile, name: str, column: NDArray[Any]) -> No
 
 
 def read_npz(path: Path) -> tuple[str, Iterator[FieldRow]]:
-    """Open an NPZ file of fields.
+    """Open an NPZ field table.
 
     Returns:
-        First line of the journal, which contains the hand, and the rows, one patch after another.
+        First line of the journal, which contains the hand; and the rows, one patch after another.
 
     Raises:
-        ConfigError: The file is not an NPZ file of fields, or has a newer version.
+        ConfigError: The file is not an NPZ field table, or has another version.
     """
     allowed = "an NPZ file of fields written by skinnode convert"
     try:

@@ -1,4 +1,4 @@
-"""Writes and reads tables of fields as Parquet, with pyarrow, an optional dependency."""
+"""Writes and reads field tables as Parquet, using pyarrow, an optional dependency."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.errors import ConfigError, Shown
 from skinnode.record.field_rows import CROSSINGS, FORMAT, NUMBERS, POINTS, PREFIX, TEXTS, WIRES, FieldRow
 
 ROWS_PER_GROUP: Final = 512
-"""Number of rows in a row group, which are in memory together: about 10 MB for patches of 10 × 30 wires."""
+"""Number of rows in a row group, which is held in memory: about 10 MB for patches of 10 × 30 wires."""
 _KEY: Final = b"skinnode"
 
 
@@ -25,10 +25,10 @@ def require_pyarrow(path: Path) -> None:
 
 
 class ParquetFile:
-    """New Parquet file of fields.
+    """New Parquet field table.
 
-    Arrays are lists in row-major order. The columns ``upper_wires``, ``upper_electrodes`` and ``lower_wires``
-    contain their dimensions U, N and K.
+    Arrays are stored as lists in row-major order. The columns ``upper_wires``, ``upper_electrodes`` and
+    ``lower_wires`` contain their dimensions U, N and K.
 
     Args:
         path: Path of the new file.
@@ -79,13 +79,13 @@ class ParquetFile:
 
 
 def read_parquet(path: Path) -> tuple[str, Iterator[FieldRow]]:
-    """Open a Parquet file of fields.
+    """Open a Parquet field table.
 
     Returns:
-        First line of the journal, which contains the hand, and the rows.
+        First line of the journal, which contains the hand; and the rows.
 
     Raises:
-        ConfigError: The file is not a Parquet file of fields, or has a newer version.
+        ConfigError: The file is not a Parquet field table, or has another version.
     """
     require_pyarrow(path)
     import pyarrow as pa
@@ -102,7 +102,7 @@ def read_parquet(path: Path) -> tuple[str, Iterator[FieldRow]]:
 
 
 def check_format(found: str, path: Path) -> None:
-    """Raise ConfigError unless ``found`` is the format of a table of fields in this version."""
+    """Raise ConfigError unless ``found`` is this version's field-table format."""
     if found == FORMAT:
         return
     if found.startswith(PREFIX):

@@ -1,4 +1,4 @@
-"""Receives the recorded frames of one bus with the host's own dispatcher, assembler and streams."""
+"""Receives one bus's recorded frames with the host's own dispatcher, assembler and streams."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _ROUNDING_NS: Final = 2_000
 
 
 class _PollerlessDispatcher(Dispatcher):
-    """Dispatcher that does not poll streams after each batch; the journal determines when to poll."""
+    """Dispatcher that does not poll the streams after each batch; the journal determines when to poll."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass
 
 
 class ReplayedBus:
-    """Receiver for one bus of a recording; contains the streams of all patches on this bus."""
+    """Receiver for one bus of a recording; contains the streams of all patches on the bus."""
 
     def __init__(self, config: BusConfig, replay: Replay, events: list[dict[str, Any]]) -> None:
         self._config, self._replay = config, replay
@@ -64,7 +64,7 @@ class ReplayedBus:
         self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host set to pre-operational
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """Process the next frame of the log; ``whole``: whether the log has been undamaged so far."""
+        """Process the next frame of the log; ``whole`` states whether the log has been undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -89,9 +89,9 @@ class ReplayedBus:
         self._dispatcher.measure(frame.t_ns)
 
     def _go_on(self, can_id: int) -> None:
-        """Go on with the same solver after a node has restarted; no journal says when the host did.
+        """Resume with the same solver after a node restart; no journal states when the host did.
 
-        After a change of the baseline, scans remain withheld, because the new baseline is unknown.
+        After a baseline change, scans remain withheld, because the new baseline is unknown.
         """
         for name, heard in self.patches.items():
             solver = self._solvers.get(name)
@@ -107,7 +107,7 @@ class ReplayedBus:
                 )
 
     def _on_command(self, data: bytes) -> None:
-        """Process an NMT command from the host, which sets its nodes to pre-operational when it exits."""
+        """Process an NMT command from the host. On exit, the host sets its nodes to pre-operational."""
         if len(data) != 2:
             return
         cob_id = od.heartbeat_cob_id(data[1])
@@ -123,11 +123,11 @@ class ReplayedBus:
             self._happen(self._events.popleft())
 
     def solver(self, patch: str) -> ScanSolver | None:
-        """Return the newest solver of a patch; None if there is none yet."""
+        """Return a patch's newest solver; None if there is none yet."""
         return self._solvers.get(patch)
 
     def stats(self) -> BusStats:
-        """Return the counters of the bus."""
+        """Return the bus counters."""
         return self._dispatcher.count(PortCounters(sent=self._sent))
 
     def _is_due(self, event: dict[str, Any], t_ns: int, *, whole: bool) -> bool:
@@ -150,7 +150,7 @@ class ReplayedBus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver for a journal event; None if the facts about the node are unknown or unusable."""
+        """Return the solver for a journal event; None if the node facts are unknown or unusable."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

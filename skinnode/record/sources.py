@@ -1,4 +1,4 @@
-"""Opens recordings, and logs of other masters, for a replay or a conversion."""
+"""Opens recordings, and logs from other masters, for a replay or a conversion."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from skinnode.transport.frame_log import LoggedFrame
 from skinnode.transport.frame_log_reader import READABLE, Damage, FrameLogReader
 
 FRAME_FILES: Final = (*READABLE, MCAP)
-"""Suffixes of the files that can contain CAN frames."""
+"""Suffixes of files that can contain CAN frames."""
 ALLOWED: Final = f"a file ending in {', '.join(FRAME_FILES[:-1])} or {FRAME_FILES[-1]}"
 
 
 class Frames(Protocol):
-    """Iterable over the frames of a file, which skips damaged parts."""
+    """Iterable over a file's frames; skips damaged parts."""
 
     path: Path
 
@@ -47,19 +47,19 @@ class Frames(Protocol):
 
 
 class ChannelMap:
-    """Buses of the channels in a file.
+    """Maps the channels in a file to buses.
 
     Args:
-        bus_of: Name of the bus of each channel.
-        only: If the first frame is on an unknown channel, its channel belongs to this bus, and no other
-            channel to any bus; None for no such rule.
+        bus_of: Bus name of each channel.
+        only: Bus to which the first frame's channel belongs if that channel is unknown; no other channel then
+            belongs to a bus. None if an unknown channel never belongs to a bus.
     """
 
     def __init__(self, bus_of: dict[str, str], only: str | None = None) -> None:
         self._bus_of, self._only = bus_of, only
 
     def bus(self, channel: str) -> str | None:
-        """Return the name of the bus of a channel; None if the channel belongs to no bus of the hand."""
+        """Return the name of a channel's bus; None if the channel belongs to no bus of the hand."""
         only, self._only = self._only, None
         if only is not None and channel not in self._bus_of:
             self._bus_of = {channel: only}
@@ -68,7 +68,7 @@ class ChannelMap:
 
 @dataclass(frozen=True, slots=True)
 class OpenRecording:
-    """Frames and journal of an open recording."""
+    """Open recording: its frames and journal."""
 
     frames: Frames
     header: Header
@@ -76,21 +76,21 @@ class OpenRecording:
     complaints: list[str]
     """One-line message for each unreadable part of the journal."""
     lines: list[str]
-    """Lines of the journal; empty if there is none."""
+    """Journal lines; empty if there is no journal."""
     journal: str
     """Name of the file that contains the journal."""
     channels: ChannelMap
     foreign: bool = False
-    """Whether there is no journal, so that the header and the events were made from a hand file."""
+    """Whether there is no journal; the header and the events were then created from a hand file."""
     notes: tuple[str, ...] = ()
-    """Assumptions that were made because there is no journal."""
+    """Assumptions made because there is no journal."""
 
 
 def open_recording(path: Path) -> OpenRecording:
     """Open a recording with its journal.
 
     Args:
-        path: File ending in .mcap; or file ending in .log, .blf or .asc with its journal in the same folder.
+        path: A .mcap file, or a .log, .blf or .asc file whose journal is in the same folder.
 
     Raises:
         ConfigError: The recording or its journal cannot be read.
@@ -116,14 +116,14 @@ def open_recording(path: Path) -> OpenRecording:
 
 
 def open_log(path: Path, hand: HandConfig) -> OpenRecording:
-    """Open a log without a journal, such as a candump log of a bus that another master runs.
+    """Open a log without a journal, such as a candump log from a bus with another master.
 
-    The patches are decoded with the layouts, code widths and baselines of the hand file. A patch without a
-    baseline file is assumed to have the resistances of its undeformed layout at rest.
+    The patches are decoded with the layouts, code widths and baselines from the hand file. A patch without a
+    baseline file is assumed to have the resistances of its undeformed layout when at rest.
 
     Args:
         path: File with CAN frames.
-        hand: The hand. The channels of the log are matched with the names and the channels of its buses.
+        hand: The hand. The log's channels are matched with its bus names and channels.
 
     Raises:
         ConfigError: The log or a baseline file cannot be read.
@@ -173,7 +173,7 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
 
 
 def _channels_in(path: Path, hand: HandConfig) -> dict[str, str]:
-    """Return the name of the bus of each channel in a log; BLF and ASC files number the channels."""
+    """Return the bus name of each channel in a log; BLF and ASC files number the channels."""
     if path.suffix in (".blf", ".asc"):
         return {str(number): bus.name for number, bus in enumerate(hand.buses)}
     return {channel: bus for bus, channel in channels(hand).items()}

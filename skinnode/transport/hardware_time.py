@@ -1,23 +1,23 @@
-"""Conversion of a CAN controller's hardware timestamps to the monotonic clock."""
+"""Converts a CAN controller's hardware timestamps to the monotonic clock."""
 
 from __future__ import annotations
 
 from typing import Final
 
 OLDEST_NS: Final = 10_000_000_000
-"""Maximum plausible age of a frame, ns. If the wall clock was set after a frame had arrived, the frame seems
-older, and its timestamp is replaced by the time at which it is read."""
+"""Maximum plausible age of a frame, ns. If the wall clock was set after a frame had arrived, the frame can
+seem older; its timestamp is then replaced by the time at which the frame is read."""
 
 DRIFT: Final = 200e-6
-"""Maximum relative drift of two clocks: two oscillators with a tolerance of 100 ppm each."""
+"""Maximum relative drift between two clocks whose oscillators each have a tolerance of 100 ppm."""
 
 
 class HardwareClock:
-    """Converts hardware timestamps of a CAN controller to the monotonic clock. Only one thread may use it.
+    """Converts a CAN controller's hardware timestamps to the monotonic clock. Only one thread may use it.
 
-    The kernel may timestamp a frame late, but never early. The difference between the kernel timestamp and
-    the hardware timestamp of a frame is therefore an upper bound on the offset between the two clocks. The
-    estimated offset follows the lowest bounds, and rises no faster than two clocks can drift apart.
+    The kernel may timestamp a frame late, but never early. The difference between a frame's kernel timestamp
+    and its hardware timestamp is therefore an upper bound on the offset between the two clocks. The estimated
+    offset follows the lowest bounds and rises no faster than two clocks can drift apart.
     """
 
     def __init__(self) -> None:

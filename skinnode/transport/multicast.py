@@ -1,18 +1,18 @@
-"""Frames in UDP multicast packets, exchanged with python-can's interface udp_multicast.
+"""Exchanges frames in UDP multicast packets, compatible with python-can's udp_multicast interface.
 
-python-can opens and configures the socket, and defines the format of the packets: a msgpack map with one
-entry per attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgpack would take
-longer than sending it. In the packets of a program, however, everything but the timestamp and the data
-recurs, so python-can converts each kind of frame only once:
+python-can opens and configures the socket, and defines the packet format: a msgpack map with one entry per
+attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgpack would take longer than
+sending it. However, everything except the timestamp and the data recurs in a program's packets, so python-can
+converts each kind of frame only once:
 
 - To send a frame, its data is inserted into a packet that python-can has packed for this identifier and
   length.
 - A received packet is compared, without its timestamp and data, with the packets that python-can has already
-  unpacked. Packets that differ from all of these, or that have another layout, are unpacked by python-can.
+  unpacked. If the packet differs from all of these or has another layout, python-can unpacks it.
 
 Packets are received in batches, with kernel timestamps and the kernel's drop counter. A sender also receives
-its own packets. They contain a tag in the channel field, which python-can transmits but does not use, and are
-skipped.
+its own packets. The sender skips these packets, which it identifies by a tag in the channel field. python-can
+transmits this field but does not use it.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ _DELIVERY_S: Final = 0.05
 
 _BATCH_PACKETS: Final = 256
 _PACKET_BYTES: Final = 4096
-"""Maximum length of a packet, bytes, as in python-can. The rest of a longer packet is cut off."""
+"""Maximum packet length, bytes, as in python-can. Longer packets are truncated."""
 
 _STAMP: Final = struct.Struct("@qq")  # struct timespec: s and ns
 _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
 _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMP.size)
 _COUNTED_BYTES: Final = _STAMPED_BYTES + socket.CMSG_SPACE(_DROPS.size)
-_HEAD: Final = b"\x8b\xa9timestamp\xcb"  # a map of 11 entries, the first of which is a 64-bit float
+_HEAD: Final = b"\x8b\xa9timestamp\xcb"  # a map with 11 entries, the first of which is a 64-bit float
 _HEAD_BYTES: Final = len(_HEAD) + 8
-"""Length of a packet's head, up to the end of the timestamp, bytes."""
-_DATA: Final = b"\xa4data\xc4"  # key of the data, and type of byte strings; followed by the length (u8)
+"""Length of a packet's head up to the end of the timestamp, bytes."""
+_DATA: Final = b"\xa4data\xc4"  # data key and byte-string type; followed by the length (u8)
 
 
 def new_tag() -> str:
-    """Return a tag for the channel field of one endpoint's packets."""
+    """Return a unique tag for the channel field of an endpoint's packets."""
     return f"skinnode-{uuid.uuid4().hex}"
 
 
@@ -67,20 +67,20 @@ _TAG_BYTES: Final = len(new_tag())
 _TAG_AT: Final = pack_message(
     can.Message(arbitration_id=0x7FF, is_extended_id=False, channel=new_tag())
 ).index(b"skinnode-")
-"""Position of the tag in packets of this program with identifiers from 0x100, bytes."""
+"""Offset of the tag in this program's packets with identifiers of 0x100 or higher, bytes."""
 _TAG_END: Final = _TAG_AT + _TAG_BYTES
 
 _RECORD: Final = struct.Struct(
     f"@{_TAG_AT}x{_TAG_BYTES}s{_PACKET_BYTES - _TAG_END}x{_CONTROL.size}xqq{_CONTROL.size}xI4x"
 )
-"""Layout of a received message in memory: packet with tag, timestamp, drop counter. The kernel adds the drop
-counter after the timestamp, as soon as it has dropped a packet."""
+"""Memory layout of a received message: packet with tag, timestamp, drop counter. Once the kernel has dropped
+a packet, it adds the drop counter after the timestamp."""
 
 _MOST_KINDS: Final = 4096
-"""Maximum number of kinds of packets to remember. Sixteen patches send 100 kinds."""
+"""Maximum number of packet kinds to remember. Sixteen patches send 100 kinds."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible time (ns) by which a timestamp is later than the reading of its frame."""
+"""Maximum plausible lead of a frame's timestamp over the time at which the frame is read, ns."""
 
 
 class _Kind(NamedTuple):
@@ -97,7 +97,7 @@ class MulticastSocket:
     """Endpoint on a multicast group. Any thread may send, but only one thread may receive.
 
     Args:
-        bus: Open python-can bus, whose socket the endpoint takes over. The bus is shut down.
+        bus: Open python-can bus. The endpoint takes over its socket and shuts the bus down.
         group: Address of the multicast group.
         tag: Result of :func:`new_tag`.
     """
@@ -112,13 +112,13 @@ class MulticastSocket:
         self._batch = MessageBatch(_BATCH_PACKETS, _PACKET_BYTES, _COUNTED_BYTES)
         self._waiting: list[Frame] = []
         self.dropped = 0
-        """Number of packets, including the endpoint's own, dropped because the receive buffer was full."""
+        """Number of packets, including the endpoint's own, dropped because of a full receive buffer."""
         self.malformed = 0
-        """Number of packets received that were not CAN frames."""
+        """Number of received packets that were not CAN frames."""
         self._sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
 
     def fileno(self) -> int:
-        """Return the file descriptor of the socket, or -1 if it is closed."""
+        """Return the socket's file descriptor, or -1 if the socket is closed."""
         return self._sock.fileno()
 
     def shutdown(self) -> None:
@@ -179,16 +179,16 @@ class MulticastSocket:
         return frames[:most]
 
     def _wait(self, timeout_s: float) -> None:
-        """Wait for frames and fetch them. Packets that are not wanted do not end the wait."""
+        """Wait for frames and fetch them. Unwanted packets do not end the wait."""
         end_s = time.monotonic() + timeout_s
         while timeout_s > 0.0:
-            # Unlike poll(2), select(2) does not round the time to ms.
+            # Unlike poll(2), select(2) does not round the timeout to ms.
             if select.select((self._sock,), (), (), timeout_s)[0] and self._fetch():
                 return
             timeout_s = end_s - time.monotonic()
 
     def _fetch(self) -> bool:
-        """Fetch packets until there are frames or no more packets. Return whether there are frames."""
+        """Fetch packets until a frame is found or no packets remain. Return whether there are frames."""
         while count := self._batch.receive(self._sock, _BATCH_PACKETS):
             self._waiting = self._unpack_batch()
             if self._waiting:
@@ -198,18 +198,18 @@ class MulticastSocket:
         return False
 
     def _unpack_batch(self) -> list[Frame]:
-        """Return the frames of other endpoints in the batch."""
+        """Return the batch's frames from other endpoints."""
         batch, unpack, own = self._batch, self._unpack, self._tag.encode()
         now_ns = time.monotonic_ns()
         wall_to_mono_ns = now_ns - time.time_ns()
         earliest_ns, latest_ns = now_ns - OLDEST_NS, now_ns + _NEWEST_NS
         frames: list[Frame] = []
-        new = tuple.__new__  # half the time of Frame.__new__
+        new = tuple.__new__  # twice as fast as Frame.__new__
         records = zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True)
         for number, ((control, length), (tag, seconds, nanoseconds, drops)) in enumerate(records):
             if control == _COUNTED_BYTES:
                 self.dropped = drops
-            if tag == own and length >= _TAG_END:  # a third of the time of unpack()
+            if tag == own and length >= _TAG_END:  # three times faster than unpack()
                 continue
             kind, data = unpack(batch.payload(number, length))
             if kind is None:
@@ -222,7 +222,7 @@ class MulticastSocket:
         return frames
 
     def _unpack(self, packet: bytes) -> tuple[_Kind | None, bytes]:
-        """Return the kind and the data of a packet. The kind of an unwanted packet is None."""
+        """Return a packet's kind and data. The kind of an unwanted packet is None."""
         at = packet.find(_DATA, _HEAD_BYTES) + len(_DATA) + 1
         end = at + packet[at - 1] if at <= len(packet) else at
         data = packet[at:end]
@@ -232,7 +232,7 @@ class MulticastSocket:
             return kinds[key], data
         try:
             message = unpack_message(packet, replace={"timestamp": 0.0}, check=True)
-        except Exception:  # whatever msgpack and can.Message raise for a packet that is not a CAN frame
+        except Exception:  # msgpack and can.Message raise various exceptions for other packets
             self.malformed += 1
             return None, b""
         kind = self._kind(message)
@@ -255,7 +255,7 @@ class MulticastSocket:
 
 
 def limit_to_group(sock: socket.socket) -> None:
-    """Limit a multicast socket to the groups that it has joined, and discard the packets received so far.
+    """Limit a multicast socket to the groups it has joined, and discard the packets received so far.
 
     python-can binds the socket to all addresses. Such a socket receives the packets of every multicast group
     that any program on this machine has joined, unless this is disabled.
@@ -268,9 +268,9 @@ def limit_to_group(sock: socket.socket) -> None:
 
 
 def _discard_other_groups(sock: socket.socket) -> None:
-    """Discard packets that were received before reception was limited to one multicast group.
+    """Discard packets received before reception was limited to one multicast group.
 
-    If there were any, discard once more after a pause, because the kernel may still be delivering packets.
+    If there were any, discard again after a pause, because the kernel may still be delivering packets.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)
@@ -278,7 +278,7 @@ def _discard_other_groups(sock: socket.socket) -> None:
 
 
 def _discard_waiting(sock: socket.socket) -> int:
-    """Discard all packets in the receive buffer of a socket, and return their number."""
+    """Discard all packets in a socket's receive buffer, and return their number."""
     count = 0
     with contextlib.suppress(BlockingIOError):
         while True:

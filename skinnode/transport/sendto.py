@@ -1,8 +1,8 @@
-"""Sending of UDP packets without releasing the global interpreter lock (GIL).
+"""Sends UDP packets without releasing the global interpreter lock (GIL).
 
-``socket.sendto`` releases the GIL for each packet. If several threads have packets to send, as the threads of
-simulated nodes do after each SYNC, every packet then hands the GIL to another thread. Switching threads takes
-longer than sending the packet.
+``socket.sendto`` releases the GIL for each packet. If several threads have packets to send, as simulated-node
+threads do after each SYNC, the GIL passes to another thread with every packet. Switching threads takes longer
+than sending the packet.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class PacketSender:
     """Sends packets from a socket to one address. Any thread may send.
 
     Args:
-        sock: IPv4 or IPv6 socket. It stays the property of the caller.
+        sock: IPv4 or IPv6 socket; remains owned by the caller.
         host: Numeric address of the receiver.
         port: UDP port of the receiver.
     """
@@ -49,5 +49,5 @@ class PacketSender:
         """
         address = self._address
         sent = _sendto(self._sock.fileno(), packet, len(packet), socket.MSG_DONTWAIT, address, len(address))
-        if sent < 0:  # this call waits, or raises the error
+        if sent < 0:  # the next call waits for room or raises the error
             self._sock.sendto(packet, self._to)

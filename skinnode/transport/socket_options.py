@@ -9,17 +9,17 @@ from collections.abc import Iterator
 from typing import Final
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of it."""
+"""Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of the buffer."""
 
 SO_RXQ_OVFL: Final = 40
-"""Option from <asm-generic/socket.h> that adds the kernel's drop counter to the ancillary data of a message.
-Python does not define it."""
+"""Option from <asm-generic/socket.h> that adds the kernel's drop counter to a message's ancillary data.
+Python does not define this constant."""
 
 _SO_RCVBUFFORCE: Final = 33  # from <asm-generic/socket.h>
 
 
 def enlarge_receive_buffer(sock: socket.socket) -> None:
-    """Set the size of a socket's receive buffer to :data:`RECEIVE_BUFFER_BYTES`, or as large as permitted."""
+    """Set a socket's receive buffer size to :data:`RECEIVE_BUFFER_BYTES`, or to the permitted maximum."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
     except OSError:  # only root may exceed net.core.rmem_max
@@ -28,7 +28,7 @@ def enlarge_receive_buffer(sock: socket.socket) -> None:
 
 @contextlib.contextmanager
 def socket_of(fileno: int) -> Iterator[socket.socket]:
-    """Give access to the socket of a file descriptor, which stays open after the ``with`` block."""
+    """Give access to a file descriptor's socket; the descriptor stays open after the ``with`` block."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         yield duplicate

@@ -6,9 +6,9 @@ Data flows in one direction::
         -> drawing_process (child process) -> drawing -> stream of the SDK -> window, browser or file
     recording -> conversion -> tick -> drawing -> stream -> file
 
-``picture`` computes what is drawn of a field, with the shapes in ``geometry``, the colours in ``colours`` and
-the places in ``placement``. ``texts`` writes tables in Markdown. ``drawing`` writes both to a recording
-``stream``, which ``blueprint`` lays out. ``outputs`` opens windows, pages and files: ``viewer_process`` runs
-the viewer as a child process, and ``web_page`` serves it to a browser without access to other computers. Only
-``drawing``, ``blueprint`` and ``stream`` require the package rerun-sdk.
+``picture`` computes a field's picture, using shapes from ``geometry`` and colours from ``colours``;
+``placement`` positions the patches. ``texts`` writes Markdown tables. ``drawing`` writes both to a recording
+``stream``; ``blueprint`` defines the window layout. ``outputs`` opens windows, pages and files:
+``viewer_process`` runs the viewer as a child process, and ``web_page`` serves it to a browser without access
+to other computers. Only ``drawing``, ``blueprint`` and ``stream`` require the package rerun-sdk.
 """

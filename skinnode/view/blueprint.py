@@ -1,4 +1,4 @@
-"""Layout of the viewer's window: the hand in 3-D, texts beside it, curves below."""
+"""Layout of the viewer's window: the hand in 3-D with texts beside it and curves below it."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from skinnode.model.layout import Float
 from skinnode.view.placement import ROOT
 
 TIME: Final = "time"
-"""Timeline of all entities: the time of the SYNC, or of the state of the hand, by the wall clock."""
+"""Timeline of all entities: the wall-clock time of the SYNC or of the hand's state."""
 SCAN: Final = "scan"
-"""Timeline of the entities of a patch: the number of the scan."""
+"""Timeline of a patch's entities: the scan number."""
 FORCE, DEPTH, LOAD = "curves/force", "curves/depth", "curves/load"
 CONTACTS, HEALTH, EVENTS = "contacts", "health", "events"
 _BACKGROUND: Final = (229, 232, 237)
 _CURVES_S: Final = 20
-"""Time span that the curves show, s."""
+"""Time span shown by the curves, s."""
 _DISTANCE: Final = 0.75
-"""Distance of the eye from the middle of the hand, in diagonals of the hand."""
+"""Distance of the camera from the hand's centre, as a multiple of the hand's diagonal."""
 
 
 def blueprint(corners_m: Float, *, live: bool) -> rrb.Blueprint:
-    """Return the layout of the window.
+    """Return the window layout.
 
     Args:
-        corners_m: (P, 3) points of the hand in its frame, m; the eye looks at their middle.
+        corners_m: (P, 3) points of the hand in its frame, m; the camera looks at their centre.
         live: Whether the window follows the newest data.
     """
     low, high = corners_m.min(axis=0), corners_m.max(axis=0)

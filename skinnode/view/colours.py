@@ -1,4 +1,4 @@
-"""Colours of a surface's points: the scale of ``skinnode monitor``, so that both show the same colours."""
+"""Colours of a surface's points, from the same colour scale as ``skinnode monitor``."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _TABLE[:, :3] = np.rint(
 
 
 def depth_rgba(depth_m: Float, unknown: NDArray[np.bool_], full_m: float) -> NDArray[np.uint8]:
-    """Return the colours (U N, 4) of a surface's points in row-major order; RGBA from 0 to 255.
+    """Return the (U N, 4) RGBA colours, 0 to 255, of a surface's points in row-major order.
 
     Args:
         depth_m: (U, N) depths, m.
-        unknown: (U, N) mask of the unknown depths.
-        full_m: Depth that has the brightest colour, m.
+        unknown: (U, N) mask of unknown depths.
+        full_m: Depth shown in the brightest colour, m.
     """
     known_m = np.where(unknown, 0.0, depth_m).ravel()
     shades = np.rint(np.clip(known_m * ((_SHADES - 1) / full_m), 0.0, _SHADES - 1)).astype(np.intp)
@@ -35,7 +35,7 @@ def depth_rgba(depth_m: Float, unknown: NDArray[np.bool_], full_m: float) -> NDA
 
 
 def grey_rgba(points: int) -> NDArray[np.uint8]:
-    """Return the colours (``points``, 4) of a surface whose displacement is unknown or out of date."""
+    """Return the (``points``, 4) colours of a surface whose displacement is unknown or out of date."""
     made = np.full((points, 4), 255, np.uint8)
     made[:, :3] = UNKNOWN_RGB
     return made

@@ -1,7 +1,7 @@
-"""Draws a recording completely and as fast as possible, for a file that is looked at later.
+"""Draws a complete recording as fast as possible to a file for later viewing.
 
-Unlike :mod:`skinnode.view.drawing_thread`, nothing is left out: the recording waits for the drawing. All
-times, including those of events, are times of the recording.
+Unlike :mod:`skinnode.view.drawing_thread`, this module skips no fields: the replay waits for the drawing. All
+times, including event times, are recording times.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skinnode.view.texts import DrawnCounts
 from skinnode.view.tick import Tick
 
 _CHECK_NS: Final = 50_000_000
-"""Interval of the recording between checks for changes of health, ns, as in a running host."""
+"""Interval between health checks in recording time, ns; the same as in a running host."""
 _EVENTS: Final = 1024
 
 Draw = Callable[[Tick], None]
@@ -32,7 +32,7 @@ class Conversion:
     """Conversion of a recording into a drawing; :meth:`run` carries it out.
 
     Args:
-        path: Log of the recording.
+        path: Log file of the recording.
         cancelled: Function called before each frame; the conversion ends when it returns True.
 
     Raises:
@@ -42,7 +42,7 @@ class Conversion:
     def __init__(self, path: Path, cancelled: Callable[[], bool] = lambda: False) -> None:
         self._cancelled = cancelled
         self.replay: Replay = replay(path, cancelled=self._before_frame)
-        """The replay; ``hand`` is the hand of the recording."""
+        """The replay; its ``hand`` is the recorded hand."""
         self.faults = FaultBook(live=False)
         self._history = History(self.replay.hand, live=False)
         events = Events()
@@ -60,11 +60,11 @@ class Conversion:
 
     @property
     def counts(self) -> DrawnCounts:
-        """Counts of the fields so far."""
+        """Field counts so far."""
         return DrawnCounts(self._drawn, 0, 0)
 
     def run(self, draw: Draw) -> None:
-        """Draw all fields of the recording and the state of the hand.
+        """Draw all the recording's fields and the hand's state.
 
         Args:
             draw: Function that draws the data of one instant.
@@ -85,7 +85,7 @@ class Conversion:
         return bool(self._pending) and self.replay.clock() - self._fields_since_ns >= 1e9 / RATE_HZ
 
     def _before_frame(self) -> bool:
-        """Check the health and draw the state if it is time; return whether to end the conversion."""
+        """Check the health and draw the state if either is due; return whether to end the conversion."""
         if self._cancelled():
             return True
         if self._draw is None:
@@ -99,7 +99,7 @@ class Conversion:
         return False
 
     def _flush(self, *, ending: bool, state: bool = False) -> None:
-        """Draw what is pending and, at the end or if asked, the state of the hand."""
+        """Draw the pending fields, and the hand's state if ``ending`` or ``state`` is true."""
         assert self._draw is not None
         now_ns, view = self._fields_ns, None
         if state or ending:

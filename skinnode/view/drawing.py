@@ -38,7 +38,7 @@ EDGE_RGB: Final = (120, 128, 140)
 STD_RGB: Final = (70, 100, 150)
 _CONTACT_RGB: Final = (40, 44, 52)
 _THIN: Final = 0.04
-"""Radius of lines, in pitches."""
+"""Line radius, in electrode pitches."""
 _PALETTE: Final = (
     (31, 119, 180),
     (255, 127, 14),
@@ -61,8 +61,8 @@ class HandDrawing:
     Args:
         stream: The recording stream; the caller sets its sinks and closes it.
         hand: The hand.
-        exaggeration: Factor of the drawn to the measured displacement.
-        wall_minus_mono_ns: Difference between the wall clock and the clock of the ticks, ns.
+        exaggeration: Ratio of drawn to measured displacement.
+        wall_minus_mono_ns: Wall-clock time minus tick time, ns.
         live: Whether the viewer follows the newest data.
     """
 
@@ -89,7 +89,7 @@ class HandDrawing:
         """Patches whose newest picture has contacts."""
 
     def _begin(self, t_ns: int) -> None:
-        """Write the layout of the window and everything that does not change."""
+        """Write the window layout and everything that does not change."""
         self._begun = True
         log, skeleton = self._stream.log, self.placement.skeleton
         corners = [
@@ -141,10 +141,10 @@ class HandDrawing:
             log(path, rr.SeriesLines(names=lines, colors=shades, widths=widths), static=True)
 
     def draw(self, tick: Tick) -> None:
-        """Write what is new at one instant.
+        """Write the new data of one instant.
 
         Args:
-            tick: New fields and, from time to time, the state of the hand.
+            tick: New fields and, from time to time, the hand's state.
         """
         if not self._begun:
             self._begin(
@@ -170,10 +170,10 @@ class HandDrawing:
             self._stream.log(window.EVENTS, rr.TextLog(f"{line.time}  {event}", level=_LEVELS[line.level]))
 
     def _draw(self, name: str, picture: PatchPicture) -> None:
-        """Write what changes with each field; :meth:`_begin` has written colours and radii.
+        """Write the data that change with each field; :meth:`_begin` has written colours and radii.
 
-        Each call of ``log`` takes about 100 µs of CPU time, so there are only two, and only one if there are
-        no contacts.
+        Each call to ``log`` takes about 100 µs of CPU time, so this method makes only two calls, or one if
+        there are no contacts.
         """
         log, path, narrow = self._stream.log, self._paths[name], np.float32
         log(
@@ -206,7 +206,7 @@ class HandDrawing:
             )
 
     def _draw_curves(self) -> None:
-        """Write the normal force and the maximum depth of every patch; NaN where nothing is known."""
+        """Write each patch's normal force and maximum depth; NaN for a patch without a current field."""
         forces_n, depths_um = [], []
         for name in self._rest_m:
             field = None if name in self._stale else self._newest.get(name)
@@ -231,7 +231,7 @@ class HandDrawing:
         log(window.CONTACTS, _markdown(contacts_text(self._frame(tick.t_ns, conditions))))
 
     def _frame(self, t_ns: int, conditions: Mapping[str, str]) -> HandFrame:
-        """Return the newest fields as a hand frame, from which contacts and wrenches are computed."""
+        """Return the newest fields as a hand frame, which computes contacts and wrenches."""
         fields = {name: each for name, each in self._newest.items() if name not in self._stale}
         scan = max((each.stamp.scan for each in fields.values() if each.stamp is not None), default=0)
         missing = {name: conditions.get(name, LATE) for name in self._rest_m if name not in fields}
@@ -256,7 +256,7 @@ class HandDrawing:
 
 
 def _time_ns(field: FieldFrame, otherwise_ns: int) -> int:
-    """Return the time of a field's SYNC or, if unknown, of its last frame, ns."""
+    """Return the field's SYNC time or, if unknown, the time of its last frame, ns."""
     if field.stamp is None:
         return otherwise_ns
     return field.stamp.t_sync_ns or field.stamp.t_receive_ns
@@ -272,10 +272,10 @@ def _transform(pose: Pose) -> rr.Transform3D:
 
 
 def _quaternions(axes: Float) -> Float:
-    """Return the rotations (C, 4), real part last, from the axes of the coordinates to the rows of ``axes``.
+    """Return the (C, 4) quaternions, real part last, that rotate the coordinate axes to the rows of ``axes``.
 
     Args:
-        axes: (C, 3, 3) axes of each contact as rows.
+        axes: (C, 3, 3) axes of each contact, as rows.
     """
     if np.array_equal(axes, np.broadcast_to(np.eye(3), axes.shape)):  # a flat patch
         return np.tile([0.0, 0.0, 0.0, 1.0], (len(axes), 1))

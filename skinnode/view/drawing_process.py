@@ -1,6 +1,6 @@
-"""Draws in a child process of low priority, so that the host keeps its processor and its interpreter lock.
+"""Draws in a low-priority child process, which leaves the CPU and the interpreter lock to the host.
 
-Drawing 16 patches 30 times per second takes a third of a processor core. On a thread of the host, this work
+Drawing 16 patches 30 times per second takes a third of a CPU core. In a thread of the host process, this work
 would compete with the host for the interpreter lock, and the host would skip scans.
 """
 
@@ -24,12 +24,12 @@ from skinnode.view.tick import Tick
 _NICE: Final = 10
 """Increment of the nice value of the child process."""
 _END_S: Final = 8.0
-"""Time limit for writing what is pending at the end, s."""
+"""Time limit for writing the pending data at the end, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawingOptions:
-    """How a hand is drawn; see :class:`~skinnode.view.drawing.HandDrawing`."""
+    """Drawing options; see :class:`~skinnode.view.drawing.HandDrawing`."""
 
     exaggeration: float
     wall_minus_mono_ns: int
@@ -37,12 +37,12 @@ class DrawingOptions:
 
 
 class DrawingProcess:
-    """Child process that draws ticks, from construction until :meth:`close`. It also ends with this process.
+    """Child process that draws ticks from construction until :meth:`close`, or until this process exits.
 
     Args:
         hand: The hand.
-        target: Where the drawing goes; a viewer, a file or both.
-        options: How the hand is drawn.
+        target: Destination of the drawing: a viewer, a file or both.
+        options: Drawing options.
 
     Raises:
         SkinError: The child process cannot draw.
@@ -64,7 +64,7 @@ class DrawingProcess:
             raise SkinError(f"drawing: {complaint}")
 
     def draw(self, tick: Tick) -> None:
-        """Pass a tick to the child process; blocks while the process has not read the previous ones.
+        """Pass a tick to the child process; block while the pipe is full of unread ticks.
 
         Raises:
             SkinError: The child process has ended.
@@ -77,10 +77,10 @@ class DrawingProcess:
             raise SkinError(f"drawing: {self._complaint()}") from None
 
     def close(self) -> None:
-        """Let the child process write what is pending, and end it."""
+        """Let the child process write its pending data, then end it."""
         self._connection.close()  # makes the child process exit
         self._process.join(_END_S)
-        if self._process.is_alive():  # a viewer does not read
+        if self._process.is_alive():  # the viewer may have stopped reading
             self._process.kill()
             self._process.join()
         self._process.close()
@@ -94,7 +94,7 @@ class DrawingProcess:
         self.close()
 
     def _complaint(self) -> str:
-        """Return why the child process has ended."""
+        """Return the reason why the child process has ended."""
         with suppress(EOFError, OSError):
             if self._connection.poll(1.0):
                 return str(self._connection.recv())
@@ -102,7 +102,7 @@ class DrawingProcess:
 
 
 def _slim(field: FieldFrame) -> FieldFrame:
-    """Return a field without the arrays that are not drawn, because copying them takes time."""
+    """Return the field without the arrays that are not drawn, because copying them takes time."""
     return amended(field, force_n=None, gain=None, core_std_m=None, data_share=None, by_prior=None, held=None)
 
 
@@ -110,7 +110,7 @@ def _run(hand: HandConfig, target: Target, options: DrawingOptions, parent: Conn
     """Draw ticks until the parent process closes its end of the pipe or exits."""
     import signal
 
-    os.environ.setdefault("RUST_LOG", "off")  # the command reports in its own words that a viewer has gone
+    os.environ.setdefault("RUST_LOG", "off")  # the command itself reports that the viewer has closed
     from skinnode.view.drawing import HandDrawing
     from skinnode.view.stream import open_stream
 

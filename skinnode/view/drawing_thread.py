@@ -1,8 +1,8 @@
-"""Draws the newest fields of a running host or a replayed recording, on a thread of its own.
+"""Draws the newest fields of a running host or a replayed recording in a separate thread.
 
-The host publishes into a bounded queue, which drops its oldest field if it is full. The thread takes the
-newest field of each patch, at most ``rate_hz`` times per second. Drawing can therefore be slow or block
-without an effect on the host.
+The host publishes to a bounded queue, which drops its oldest field when it is full. At most ``rate_hz`` times
+per second, the thread takes the newest field of each patch. Slow or blocked drawing therefore does not affect
+the host.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from skinnode.view.texts import DrawnCounts
 from skinnode.view.tick import Tick
 
 RATE_HZ: Final = 30.0
-"""Default limit of drawn fields per patch and second; screens show at most 60 pictures per second."""
+"""Default limit on fields drawn per patch and second; screens show at most 60 frames per second."""
 STATE_S: Final = 0.25
-"""Interval between drawings of health, contacts as text and bus load, s."""
+"""Interval between updates of the health, contact text and bus load, s."""
 _QUEUED: Final = 8
 """Capacity of the queue, in fields per patch."""
 
@@ -33,7 +33,7 @@ class DrawingThread:
 
     Args:
         source: Host or recording; the caller closes it.
-        draw: Function that draws the new data, called on the thread.
+        draw: Function that draws the new data; called in this thread.
         rate_hz: Maximum number of drawn fields per patch and second.
     """
 
@@ -41,7 +41,7 @@ class DrawingThread:
         self._source, self._draw, self._period_s = source, draw, 1.0 / rate_hz
         self.faults = FaultBook(live=source.live)
         self.failure: SkinError | None = None
-        """Error of the source or of the drawing; None if none has occurred."""
+        """Error from the source or the drawing; None if no error has occurred."""
         self._history = History(source.hand, live=source.live)
         self._fields = source.fields(_QUEUED * len(source.hand.patches))
         self._drawn = self._left_out = 0
@@ -52,11 +52,11 @@ class DrawingThread:
 
     @property
     def counts(self) -> DrawnCounts:
-        """Counts of the fields since the start."""
+        """Field counts since the start."""
         return DrawnCounts(self._drawn, self._left_out, self._fields.dropped)
 
     def close(self) -> None:
-        """Draw what is still queued, then end and join the thread."""
+        """Draw the fields still queued, then end and join the thread."""
         self._stop.set()
         self._thread.join()
         self._fields.close()
@@ -79,13 +79,13 @@ class DrawingThread:
                 self._turn(ending=ending)
         except SkinError as error:
             self.failure = error
-        except Exception as error:  # the host must go on, and the user must be told
+        except Exception as error:  # the host must keep running; the command reports the error
             self.failure = SkinError(f"drawing: {error!r}")
 
     def _turn(self, *, ending: bool) -> None:
-        """Draw the newest field of each patch and, if it is due, the state of the hand."""
+        """Draw the newest field of each patch and, if due, the hand's state."""
         newest: dict[str, FieldFrame] = {}
-        for _ in range(_QUEUED * len(self._source.hand.patches)):  # a fast host must not occupy the loop
+        for _ in range(_QUEUED * len(self._source.hand.patches)):  # a fast host must not keep the loop busy
             field = self._fields.get(0.0)
             if field is None:
                 break

@@ -1,7 +1,7 @@
-"""Shapes drawn in three dimensions, as arrays in the coordinates of a patch: its surface, edge and contacts.
+"""Shapes drawn in 3-D, as arrays in patch coordinates: the surface, its edge and the contacts.
 
-A surface is the grid of the upper electrodes, (U, N, 3) in metres. The second index runs along an upper wire
-(x), the first from wire to wire (y), and z points out of the skin.
+A surface is the (U, N, 3) grid of upper electrodes, in metres. The first index counts the upper wires (y),
+the second the electrodes along a wire (x), and z points out of the skin.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from skinnode.model.frames import Contact
 from skinnode.model.layout import Float
 
 RING_POINTS: Final = 33
-"""Number of points of the circle around a contact; the last point equals the first."""
+"""Number of points in the circle around a contact; the last point equals the first."""
 
 
 def triangles(wires: int, electrodes: int) -> NDArray[np.uint32]:
-    """Return the triangles (T, 3) of a grid, as indices into its points in row-major order.
+    """Return the (T, 3) triangles of a grid, as indices into its points in row-major order.
 
-    Each cell of the grid consists of two triangles, counter-clockwise when seen from outside the skin. A grid
-    with one row or one column has no triangles.
+    Each grid cell consists of two triangles, counter-clockwise as seen from outside the skin. A grid with one
+    row or one column has no triangles.
 
     Args:
         wires: Number of rows, U.
@@ -36,17 +36,17 @@ def triangles(wires: int, electrodes: int) -> NDArray[np.uint32]:
 
 
 def normals(surface_m: Float) -> Float:
-    """Return the unit normals (U, N, 3) of a surface, pointing out of the skin.
+    """Return the (U, N, 3) unit normals of a surface, pointing out of the skin.
 
-    A normal is perpendicular to the differences of the neighbouring points, central inside the grid and
-    one-sided at its edge. Where the surface has no extent, the normal is the z axis.
+    A normal is perpendicular to the differences between neighbouring points: central differences inside the
+    grid, one-sided differences at its edge. Where the surface is degenerate, the normal is the z axis.
 
     Args:
         surface_m: (U, N, 3) points, m.
     """
     if min(surface_m.shape[:2]) < 2:
         return np.broadcast_to(np.array([0.0, 0.0, 1.0]), surface_m.shape).copy()
-    # np.gradient and np.cross take three times as long
+    # np.gradient and np.cross are three times slower
     along, across = np.empty_like(surface_m), np.empty_like(surface_m)
     along[:, 1:-1] = surface_m[:, 2:] - surface_m[:, :-2]
     along[:, 0], along[:, -1] = surface_m[:, 1] - surface_m[:, 0], surface_m[:, -1] - surface_m[:, -2]
@@ -65,18 +65,18 @@ def normals(surface_m: Float) -> Float:
 
 
 def displaced_m(rest_m: Float, displacement_m: Float, exaggeration: float) -> Float:
-    """Return the surface with its displacement enlarged, (U, N, 3) in m; unknown displacements count as zero.
+    """Return the (U, N, 3) surface, m, with exaggerated displacement; unknown displacements count as zero.
 
     Args:
         rest_m: (U, N, 3) positions of the electrodes at rest, m.
         displacement_m: (U, N, 3) displacements, m; NaN where unknown.
-        exaggeration: Factor of the drawn to the measured displacement.
+        exaggeration: Ratio of drawn to measured displacement.
     """
     return rest_m + exaggeration * np.where(np.isfinite(displacement_m), displacement_m, 0.0)
 
 
 def edge_m(surface_m: Float) -> Float:
-    """Return the edge of a surface as a closed line, (P, 3) in m, counter-clockwise seen from outside.
+    """Return a surface's edge as a closed (P, 3) line, m, counter-clockwise as seen from outside the skin.
 
     Args:
         surface_m: (U, N, 3) points, m.
@@ -87,10 +87,10 @@ def edge_m(surface_m: Float) -> Float:
 
 
 def ring_m(contact: Contact, lift_m: float) -> Float:
-    """Return the circle whose area is that of a contact, (:data:`RING_POINTS`, 3) in m, closed.
+    """Return a closed (:data:`RING_POINTS`, 3) circle, m, with the same area as a contact.
 
     Args:
-        contact: Contact, in the coordinates of the patch.
+        contact: Contact in patch coordinates.
         lift_m: Height of the circle above the undeformed skin, m.
     """
     radius_m = math.sqrt(max(contact.area_m2, 0.0) / math.pi)
@@ -101,7 +101,7 @@ def ring_m(contact: Contact, lift_m: float) -> Float:
 
 
 def force_n(contact: Contact) -> Float:
-    """Return the force of a contact on the skin, (3,) in N, in the coordinates of the patch.
+    """Return a contact's (3,) force on the skin, N, in patch coordinates.
 
     Args:
         contact: Contact; a positive normal force points into the skin.

@@ -1,4 +1,4 @@
-"""Opens where a drawing goes: a window, a browser, a file, or a file and one of the others."""
+"""Opens the outputs of a drawing: a window, a web page, a file, or a file together with one of the others."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from skinnode.view.viewer_process import (
 from skinnode.view.web_page import WebPage
 
 PORT: Final = 9090
-"""Default port of the web page; the browser fetches the data at the next port."""
+"""Default port of the web page; the browser fetches the data from the next port."""
 SUFFIX: Final = ".rrd"
 
 
 @dataclass(frozen=True, slots=True)
 class OutputOptions:
-    """Where a drawing goes."""
+    """Outputs of a drawing."""
 
     window: bool
     web: bool
@@ -40,14 +40,14 @@ class Output:
     """An open output."""
 
     viewer: ViewerProcess | None
-    """Window, or server of the data for browsers; None for a file."""
+    """Window, or data server for browsers; None if the drawing goes only to a file."""
     page_url: str | None
-    """Address of the web page; None without ``web``."""
+    """URL of the web page; None without ``web``."""
     save: Path | None
-    """File to write; None for no file."""
+    """File to write; None if no file is written."""
 
     def target(self, name: str) -> Target:
-        """Return where to draw.
+        """Return the viewer and file to draw to.
 
         Args:
             name: Name of the recording, shown in the viewer.
@@ -60,9 +60,9 @@ class Target:
     """Viewer and file to which the SDK sends a drawing."""
 
     url: str | None
-    """Address of the viewer; None for no viewer."""
+    """URL of the viewer; None if there is no viewer."""
     save: Path | None
-    """File; None for no file."""
+    """File to write; None if no file is written."""
     name: str
     """Name of the recording, shown in the viewer."""
 
@@ -72,7 +72,7 @@ def open_output(options: OutputOptions) -> Iterator[Output]:
     """Check the file and start the viewer; end the viewer on exit.
 
     Args:
-        options: Where the drawing goes.
+        options: Outputs to open.
 
     Raises:
         ConfigError: There is no display, a port is in use, or the file exists or cannot be written.
@@ -92,7 +92,7 @@ def open_output(options: OutputOptions) -> Iterator[Output]:
 
 
 def require_new_file(path: Path) -> None:
-    """Raise ConfigError if a recording cannot be written to ``path`` as a new file."""
+    """Raise ConfigError if ``path`` is not the name of a new, writable recording file."""
     if path.suffix != SUFFIX:
         raise ConfigError("--save", str(path), f"a file name that ends in {SUFFIX}")
     try:
@@ -107,7 +107,7 @@ def require_new_file(path: Path) -> None:
 
 
 def _serve(stack: ExitStack, options: OutputOptions) -> tuple[ViewerProcess, str]:
-    """Start the server of the data and the web page."""
+    """Start the data server and the web page."""
     address, port = options.address, options.port
     require_free(address, port)
     files_port = free_port()

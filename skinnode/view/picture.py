@@ -1,4 +1,4 @@
-"""Computes what is drawn of a field: its surface, arrows and contacts, as arrays. Needs no viewer."""
+"""Computes a field's picture as arrays: surface, arrows and contacts. Does not require the viewer."""
 
 from __future__ import annotations
 
@@ -15,62 +15,63 @@ from skinnode.view.colours import depth_rgba, grey_rgba
 from skinnode.view.geometry import displaced_m, force_n, normals, ring_m
 
 FORCE_M_PER_N: Final = 0.012
-"""Length of the arrow of a force of 1 N, m."""
+"""Arrow length for a force of 1 N, m."""
 SHEAR: Final = 4.0
-"""Factor by which shear arrows are longer than the enlarged displacement: shear is about a quarter of the
-depth, as on the maps of the monitor."""
+"""Extra magnification of shear arrows relative to the surface, as on the monitor's maps: shear is about a
+quarter of the depth."""
 _SHORT: Final = 0.05
-"""Minimum shear drawn as an arrow, as a fraction of the depth that has the brightest colour."""
+"""Minimum shear drawn as an arrow, as a fraction of the depth shown in the brightest colour."""
 _LIFT: Final = 0.05
-"""Height of shear arrows and contacts above the surface, in pitches."""
+"""Height of shear arrows and contacts above the surface, in electrode pitches."""
 
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """How fields are drawn."""
+    """Scales of a picture."""
 
     exaggeration: float
-    """Factor of the drawn to the measured displacement."""
+    """Ratio of drawn to measured displacement."""
     full_m: float
-    """Depth that has the brightest colour, m."""
+    """Depth shown in the brightest colour, m."""
     pitch_m: float
     """Distance between neighbouring electrodes of the patch, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchPicture:
-    """What is drawn of one field, in the coordinates of the patch; all lengths in m.
+    """Picture of one field, in patch coordinates; all lengths are in metres.
 
-    With C contacts and S shear arrows, the points are those of the (U, N) grid in row-major order.
+    C is the number of contacts and S the number of shear arrows. The points are those of the (U, N) grid, in
+    row-major order.
     """
 
     points_m: Float
-    """(U N, 3) surface with enlarged displacement."""
+    """(U N, 3): surface with exaggerated displacement."""
     normals: Float
-    """(U N, 3) unit normals of this surface."""
+    """(U N, 3): unit normals of this surface."""
     rgba: NDArray[np.uint8]
-    """(U N, 4) colours by depth."""
+    """(U N, 4): colours by depth."""
     shear_origins_m: Float
-    """(S, 3) electrodes whose shear is certain."""
+    """(S, 3): start points of the shear arrows, just above the electrodes whose shear is significant."""
     shear_m: Float
-    """(S, 3) arrows of the shear, :data:`SHEAR` times as much enlarged as the displacement."""
+    """(S, 3): shear arrows, magnified :data:`SHEAR` times more than the surface displacement."""
     force_origins_m: Float
-    """(C, 3) begin of each contact's force arrow, which ends at the centre of the contact."""
+    """(C, 3): start point of each contact's force arrow, which ends at the contact's centre."""
     force_m: Float
-    """(C, 3) arrows of the forces on the skin, :data:`FORCE_M_PER_N` per newton."""
+    """(C, 3): arrows of the forces on the skin, :data:`FORCE_M_PER_N` long per newton."""
     force_std_m: Float
-    """(C, 3) half-axes of the 95 % ellipsoid of each force along the axes of the contact, on the same scale
-    as the arrow."""
+    """(C, 3): half-axes of each force's 95 % ellipsoid along the contact's axes, on the same scale as the
+    arrow."""
     force_axes: Float
-    """(C, 3, 3) axes of each contact as rows."""
+    """(C, 3, 3): axes of each contact, as rows."""
     rings_m: tuple[Float, ...]
-    """Circle of each contact's area."""
+    """Circles with the same areas as the contacts."""
     labels: tuple[str, ...]
-    """Normal force of each contact with its standard deviation."""
+    """Normal force of each contact, with its standard deviation."""
 
 
 def picture_of(field: FieldFrame, rest_m: Float, style: Style) -> PatchPicture:
-    """Return what is drawn of a field.
+    """Return the picture of a field.
 
     Args:
         field: The field.
@@ -106,7 +107,7 @@ def picture_of(field: FieldFrame, rest_m: Float, style: Style) -> PatchPicture:
 
 
 def stale_picture_of(rest_m: Float) -> PatchPicture:
-    """Return what is drawn of a patch without an up-to-date field: its surface at rest, grey.
+    """Return the picture of a patch without an up-to-date field: its surface at rest, in grey.
 
     Args:
         rest_m: (U, N, 3) positions of the electrodes at rest, m.
@@ -128,7 +129,7 @@ def stale_picture_of(rest_m: Float) -> PatchPicture:
 
 
 def _certain_shear(field: FieldFrame, full_m: float) -> NDArray[np.bool_]:
-    """Return the mask (U, N) of the electrodes whose shear exceeds its noise and is visible."""
+    """Return the (U, N) mask of the electrodes whose shear is significant and large enough to be visible."""
     x_m, y_m = field.displacement_m[..., 0], field.displacement_m[..., 1]
     std_m = np.maximum(field.displacement_std_m[..., 0], field.displacement_std_m[..., 1])
     least_m = np.maximum(SURE * std_m, _SHORT * full_m)
@@ -136,7 +137,7 @@ def _certain_shear(field: FieldFrame, full_m: float) -> NDArray[np.bool_]:
 
 
 def _centre_m(centroid_m: Float, rest_m: Float, moved_m: Float) -> Float:
-    """Return where the centre of a contact is drawn, (3,) in m: moved as the electrode closest to it."""
+    """Return the drawn (3,) centre of a contact, m, displaced like the nearest electrode."""
     distances = np.linalg.norm(rest_m - centroid_m, axis=-1)
     nearest = np.unravel_index(int(distances.argmin()), distances.shape)
     return np.asarray(centroid_m + moved_m[nearest] - rest_m[nearest])

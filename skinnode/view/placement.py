@@ -1,4 +1,4 @@
-"""Places of the patches in the picture: their poses in the hand file or, without poses, side by side."""
+"""Places the patches in the picture: at their poses from the hand file or, without poses, side by side."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from skinnode.model.layout import PatchLayout
 from skinnode.model.pose import Pose
 
 ROOT: Final = "skin"
-"""Entity that holds the links and patches; its frame is that of the hand."""
+"""Parent entity of the links and patches; its coordinate frame is the hand's."""
 _GAP: Final = 1.4
-"""Distance between the centres of patches that are drawn side by side, in widths of the largest patch."""
+"""Centre-to-centre distance of patches drawn side by side, in widths of the largest patch."""
 _SAME_M: Final = 1e-6
-"""Maximum distance between two patches in the same place, m."""
+"""Maximum distance at which two patches count as being in the same place, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where the patches are drawn."""
+    """Positions at which the patches are drawn."""
 
     skeleton: Skeleton
-    """Poses of the patches on their links, and of the links in the hand."""
+    """Patch poses on their links, and link poses in the hand."""
     side_by_side: bool
-    """Whether the patches are drawn side by side because the hand file puts several in the same place."""
+    """Whether the patches are drawn side by side, because the hand file puts several in the same place."""
 
     def path(self, patch: str) -> list[str]:
-        """Return the parts of a patch's entity path: ``skin``, the name of the link and that of the patch."""
+        """Return the parts of a patch's entity path: ``skin``, the link's name and the patch's name."""
         return [ROOT, self.skeleton.mount(patch).link, patch]
 
 
 def placement_of(hand: HandConfig, layouts: Mapping[str, PatchLayout]) -> Placement:
-    """Return where the patches of a hand are drawn.
+    """Return the positions at which a hand's patches are drawn.
 
     Args:
         hand: The hand.
-        layouts: Layout of each patch by name.
+        layouts: Layout of each patch, by name.
     """
     skeleton = Skeleton.of(hand)
     places = []
@@ -56,7 +56,7 @@ def placement_of(hand: HandConfig, layouts: Mapping[str, PatchLayout]) -> Placem
 
 
 def _rows(layouts: Mapping[str, PatchLayout]) -> dict[str, Mount]:
-    """Return a mount for each patch, in rows that are read from left to right and from top to bottom."""
+    """Return a mount for each patch, in rows from left to right and from top to bottom."""
     spans = {name: np.ptp(each.upper_m.reshape(-1, 3), axis=0) for name, each in layouts.items()}
     width, height = (
         _GAP * max(float(span[axis]) + layouts[name].pitch_m for name, span in spans.items())

@@ -1,4 +1,4 @@
-"""Opens a recording stream of the SDK, which sends a drawing to a viewer, a file or both."""
+"""Opens an SDK recording stream, which sends a drawing to a viewer, a file or both."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from skinnode.view.outputs import Target
 _APPLICATION: Final = "skinnode"
 _FLUSH_S: Final = 5.0
 _BATCH_MS: Final = 20
-"""Maximum delay of data in the SDK, ms; less than the interval between two pictures."""
+"""Maximum time that the SDK holds data back, ms; shorter than the interval between two pictures."""
 
 
 @contextmanager
 def open_stream(target: Target) -> Iterator[rr.RecordingStream]:
-    """Open a stream; on exit, write what is pending and close it.
+    """Open a stream; on exit, write the pending data and close it.
 
     Args:
-        target: Where the drawing goes.
+        target: Destination of the drawing.
     """
     batches = rr.ChunkBatcherConfig.LOW_LATENCY()
     batches.flush_tick = _BATCH_MS * 1e-3
     stream = rr.RecordingStream(_APPLICATION, batcher_config=batches)
-    stream.set_log_time_enabled(False)  # all data have times of their own
+    stream.set_log_time_enabled(False)  # all data carry their own times
     stream.set_log_tick_enabled(False)
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if target.url is not None:
@@ -38,6 +38,6 @@ def open_stream(target: Target) -> Iterator[rr.RecordingStream]:
     try:
         yield stream
     finally:
-        with suppress(RuntimeError):  # a viewer that has gone or does not read; a file is written up to here
+        with suppress(RuntimeError):  # the viewer has gone or stopped reading; a file is complete up to here
             stream.flush(timeout_sec=_FLUSH_S)
         stream.disconnect()

@@ -1,4 +1,4 @@
-"""Texts of the picture, in Markdown: contacts and wrenches with their deviations, health, bus load."""
+"""Markdown texts beside the picture: contacts and wrenches with standard deviations, health, bus load."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MARKDOWN: Final = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]<>()#+
 
 @dataclass(frozen=True, slots=True)
 class DrawnCounts:
-    """Counts of the fields since the start. Their sum is the number of fields that the host has published."""
+    """Field counts since the start. Their sum is the number of fields that the host has published."""
 
     drawn: int
     left_out: int
@@ -29,14 +29,14 @@ class DrawnCounts:
 
 
 def contacts_text(frame: HandFrame) -> str:
-    """Return the contacts of a hand, and the total wrench on each link and on the hand.
+    """Return the text that lists a hand's contacts and the total wrench on each link and on the hand.
 
     Args:
         frame: Newest fields of all patches.
     """
     wrenches = [*frame.wrenches.values(), frame.wrench]
     names = [*frame.wrenches, "whole hand"]
-    one = len(frame.wrenches) == 1  # the wrench on the only link differs only by its frame
+    one = len(frame.wrenches) == 1  # with one link, its wrench differs only in the frame
     rows = list(zip(names, wrenches, strict=True))[1 if one else 0 :]
     head = ("contact on", "normal force", "shear force", "position in the hand", "area")
     contacts = _table(head, [_contact_row(contact) for contact in frame.contacts])
@@ -66,11 +66,11 @@ def _wrench_row(name: str, wrench: Wrench) -> tuple[str, ...]:
 
 
 def health_text(view: View, counts: DrawnCounts, notes: Iterable[str] = ()) -> str:
-    """Return the state of all patches and buses, and what was drawn.
+    """Return the text that gives the state of all patches and buses, and the field counts.
 
     Args:
         view: State of the hand.
-        counts: Counts of the fields.
+        counts: Field counts.
         notes: Remarks about the picture, one line each.
     """
     patches = [
@@ -119,5 +119,5 @@ def _three(vector: Float, digits: int) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text without Markdown: names and messages of devices are shown as they are."""
+    """Escape Markdown characters so that the viewer shows device names and messages literally."""
     return text.translate(_MARKDOWN)

@@ -1,4 +1,4 @@
-"""Data that is drawn at one instant."""
+"""Data drawn at one instant."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from skinnode.view.texts import DrawnCounts
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What is drawn at one instant."""
+    """Data drawn at one instant."""
 
     t_ns: int
-    """Time on the monotonic clock of the source, ns."""
+    """Time on the source's monotonic clock, ns."""
     fields: Mapping[str, FieldFrame]
-    """New fields by patch name."""
+    """New fields, by patch name."""
     counts: DrawnCounts
     view: View | None = None
     """State of the hand; None if it is not drawn at this instant."""

@@ -1,7 +1,8 @@
-"""Runs the program ``rerun`` of the package rerun-sdk as a child process: as a window, or as a server.
+"""Runs the ``rerun`` program from the package rerun-sdk as a child process: as a window or as a server.
 
-The program sends usage statistics unless its configuration file forbids it. Its child process therefore has a
-configuration folder of its own, with a file that does. The user's settings are neither read nor changed.
+The program sends usage statistics unless its configuration file disables them. The child process therefore
+gets a separate configuration folder with a file that disables them. The user's settings are neither read nor
+changed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from skinnode.process.child_processes import starting_children
 
 LOCAL: Final = "127.0.0.1"
 MEMORY: Final = "512MB"
-"""Memory for data that a browser has not fetched yet; the oldest data are dropped beyond."""
+"""Memory limit for data kept for browsers; beyond it, the oldest data are dropped."""
 _STYLES: Final = re.compile(r"\x1b\[[0-9;]*m")
 _READY_S: Final = 30.0
 _END_S: Final = 5.0
@@ -35,16 +36,16 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 class ViewerProcess:
-    """Child process that receives data on a TCP port; ended by :meth:`close`, or with this process.
+    """Child process that receives data on a TCP port until :meth:`close`, or until this process exits.
 
     Args:
         address: Address on which the process listens.
         port: Port on which the process receives data.
-        options: Further options of the program ``rerun``.
+        options: Further options for the ``rerun`` program.
 
     Raises:
         ConfigError: The port is in use or the address does not belong to this machine.
-        SkinError: The program ended before it listened.
+        SkinError: The program ended before it started to listen.
     """
 
     def __init__(self, address: str, port: int, options: list[str]) -> None:
@@ -62,7 +63,7 @@ class ViewerProcess:
                 preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
         self.url = f"rerun+http://{_reachable(address)}:{port}/proxy"
-        """Address to which the SDK sends data."""
+        """URL to which the SDK sends data."""
         try:
             self._wait_until_it_listens(address, port)
         except BaseException:
@@ -76,11 +77,11 @@ class ViewerProcess:
 
     @property
     def closed(self) -> bool:
-        """Whether the process has ended without a fault, because its window was closed."""
+        """Whether the process has exited without an error because its window was closed."""
         return self._process.poll() == 0
 
     def why(self) -> str:
-        """Return the last line that the process printed, or the signal that ended it."""
+        """Return the last line that the process wrote to stderr or, if none, the signal that ended it."""
         lines = _STYLES.sub("", self._errors.read_text("utf-8", "replace")).splitlines()
         status = self._process.poll()
         silent = "no message" if status is None or status >= 0 else signal.strsignal(-status)
@@ -144,7 +145,7 @@ def require_free(address: str, port: int) -> None:
 
 
 def free_port() -> int:
-    """Return a port of this machine that no program uses at present."""
+    """Return a port of this machine that is currently free."""
     with socket.socket() as trial:
         trial.bind((LOCAL, 0))
         port: int = trial.getsockname()[1]
@@ -167,7 +168,7 @@ def _program() -> Path:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return the environment of the child process: without usage statistics and without telemetry."""
+    """Return the child process's environment, with usage statistics and telemetry disabled."""
     config = folder / "config" / "rerun" / "analytics.json"
     config.parent.mkdir(parents=True)
     settings = {

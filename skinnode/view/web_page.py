@@ -1,9 +1,9 @@
-"""Serves the viewer of rerun-sdk to a browser, without any access to other computers.
+"""Serves the rerun-sdk viewer to a browser, without any access to other computers.
 
-The page of the SDK loads fonts from elsewhere, and its viewer sends usage statistics. This server passes the
-page on without the fonts and with a content security policy: the browser refuses every connection except to
-this server and to the port on which the data are. The setting that the viewer keeps in the browser is also
-switched off.
+The SDK's page loads fonts from elsewhere, and its viewer sends usage statistics. This server passes the page
+on without the fonts and with a content security policy: the browser blocks every connection except to this
+server and to the data port. The page also disables the statistics setting that the viewer stores in the
+browser.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _FILES: Final = ("/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/apple-
 _ELSEWHERE: Final = re.compile(
     rb"<link\b[^>]*https?://[^>]*>|<script\b[^>]*\bsrc=\"https?://[^>]*>\s*</script>"
 )
-"""Elements of the page that load something from another computer."""
+"""Page elements that load something from another computer."""
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
 _NO_STATISTICS: Final = (
     b"<script>localStorage.setItem('rerun_config', "
     b"JSON.stringify({analytics_id: 'none', analytics_enabled: false}));</script>"
 )
 _OPTIONS: Final = {"hide_welcome_screen": "1", "persist": "0"}
-"""Query of the page: neither the welcome screen, which loads examples, nor the layout of an earlier visit."""
+"""Page query: disables the welcome screen, which loads examples, and the saved layout of an earlier visit."""
 
 
 class WebPage:
@@ -40,8 +40,8 @@ class WebPage:
     Args:
         address: Address on which to listen.
         port: Port on which to listen.
-        data_port: Port at which the browser fetches the data.
-        files_port: Port of this machine at which the SDK serves the files of its viewer.
+        data_port: Port from which the browser fetches the data.
+        files_port: Local port on which the SDK serves its viewer files.
 
     Raises:
         ConfigError: The port is in use or the address does not belong to this machine.
@@ -76,11 +76,11 @@ class WebPage:
 
 
 def policy(host: str, data_port: int) -> str:
-    """Return the content security policy of the page.
+    """Return the page's content security policy.
 
     Args:
-        host: Name or address of this computer, as the browser knows it.
-        data_port: Port at which the browser fetches the data.
+        host: Name or address by which the browser knows this computer.
+        data_port: Port from which the browser fetches the data.
     """
     return (
         "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; "
@@ -91,16 +91,16 @@ def policy(host: str, data_port: int) -> str:
 
 
 def page_of(page: bytes) -> bytes:
-    """Return the page of the SDK without parts from elsewhere and with usage statistics switched off."""
+    """Return the SDK's page without external elements and with usage statistics disabled."""
     return _ELSEWHERE.sub(b"", page).replace(b"<head>", b"<head>" + _NO_STATISTICS, 1)
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers GET for the page and for the files of the viewer; anything else does not exist."""
+    """Answers GET requests for the page and the viewer files; every other path gives 404."""
 
     ports: tuple[int, int]
     otherwise: str
-    """Name of this computer for a browser that names none."""
+    """Host name used if the browser's request has no valid ``Host`` header."""
     protocol_version = "HTTP/1.1"
     timeout = 30.0
 
@@ -123,7 +123,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True  # the browser or the SDK's server has gone
 
     def _host(self) -> str:
-        """Return the name of this computer as the browser wrote it, without the port."""
+        """Return this computer's name from the request's ``Host`` header, without the port."""
         named = re.sub(r":\d+$", "", self.headers.get("Host", ""))
         return named if _HOST.fullmatch(named) else self.otherwise
 
@@ -137,7 +137,7 @@ class _Handler(BaseHTTPRequestHandler):
             return answer.read()
 
     def _pass_on(self, path: str) -> None:
-        """Pass on a file of the SDK piece by piece: the largest has 43 MB."""
+        """Pass on an SDK file in pieces, because the largest file is 43 MB."""
         connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
         connection.request("GET", path)
         with connection.getresponse() as answer:
@@ -164,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Print nothing: stderr is for the messages of the command."""
+        """Print nothing, because stderr is reserved for the command's messages."""
 
 
 def _family(address: str) -> socket.AddressFamily:

@@ -62,6 +62,8 @@ int64 t_receive_ns
 int64 t_solved_ns
 bool trusted
 bool tested              # whether the readings were tested
+int8 touched             # 1 if the patch is touched, 0 if not, -1 if unknown
+float64 touch_odds       # odds of touch to no touch; NaN if unknown
 bool precise             # whether the standard deviations are within their limits
 string distrust          # reason why the field is not trusted
 string method            # exact or posterior

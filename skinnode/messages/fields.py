@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -79,6 +80,8 @@ def field_info(field: FieldFrame, t_ns: int) -> Any:
         t_solved_ns=stamp.t_solved_ns,
         trusted=field.trusted,
         tested=field.distrust is not None,
+        touched=-1 if field.touched is None else int(field.touched),
+        touch_odds=math.nan if field.touch_odds is None else float(field.touch_odds),
         precise=bool(field.precise),
         distrust=field.distrust or "",
         method=field.method,

@@ -7,6 +7,7 @@ whether ``wires_trusted`` is known.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -30,9 +31,12 @@ NUMBERS: Final = {
     "tested": "|b1",
     "precise": "|b1",
     "noise_factor": "<f8",
+    "touched": "|i1",
+    "touch_odds": "<f8",
 }
 """Columns with one number per field, and their types. ``time_ns`` is the time of the SYNC or, if the SYNC is
-unknown, of the last frame, in ns since 1970. The other times are on the host's monotonic clock."""
+unknown, of the last frame, in ns since 1970. The other times are on the host's monotonic clock. ``touched``
+is 1 or 0, or -1 if unknown; unknown ``touch_odds`` are NaN."""
 TEXTS: Final = ("method", "distrust")
 """Columns with one text per field."""
 WIRES: Final = {
@@ -87,6 +91,8 @@ def row_of(field: FieldFrame, resistance: ResistanceFrame, offset_ns: int) -> Fi
         "tested": field.distrust is not None,
         "precise": bool(field.precise),
         "noise_factor": float(field.noise_factor),
+        "touched": -1 if field.touched is None else int(field.touched),
+        "touch_odds": math.nan if field.touch_odds is None else field.touch_odds,
         "method": field.method,
         "distrust": field.distrust or "",
         "status": np.array(field.status, dtype=np.uint8),

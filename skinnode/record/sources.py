@@ -95,7 +95,7 @@ def open_recording(path: Path) -> OpenRecording:
     Raises:
         ConfigError: The recording or its journal cannot be read.
     """
-    if not path.name:
+    if path.suffix not in FRAME_FILES:
         raise ConfigError("recording", str(path), ALLOWED)
     if path.suffix == MCAP:
         reader = McapReader(path)
@@ -126,11 +126,12 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
         hand: The hand. The log's channels are matched with its bus names and channels.
 
     Raises:
-        ConfigError: The log or a baseline file cannot be read.
+        ConfigError: The log or a baseline file cannot be read, or the log has a journal.
     """
-    if not path.name:
+    if path.suffix not in FRAME_FILES:
         raise ConfigError("recording", str(path), ALLOWED)
     frames: Frames = McapReader(path) if path.suffix == MCAP else FrameLogReader(path)
+    _require_no_journal(path, frames)
     guests = tuple(bus.model_copy(update={"role": "guest"}) for bus in hand.buses)
     hand = hand.model_copy(update={"buses": guests})
     events: list[dict[str, Any]] = []
@@ -170,6 +171,15 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
         foreign=True,
         notes=tuple(notes),
     )
+
+
+def _require_no_journal(path: Path, frames: Frames) -> None:
+    """Raise ConfigError if a log has a journal, whose hand and events would otherwise be ignored."""
+    journal = path.with_suffix(SUFFIX)
+    inside = isinstance(frames, McapReader) and any(frames.journal())
+    if inside or (not isinstance(frames, McapReader) and journal.exists()):
+        where = path.name if inside else journal.name
+        raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} has the hand")
 
 
 def _channels_in(path: Path, hand: HandConfig) -> dict[str, str]:

@@ -12,9 +12,11 @@ from typer.testing import CliRunner
 
 from skinnode.cli.main import app
 from skinnode.config import HandConfig, load_hand
+from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, replay
+from skinnode.record.convert import convert
 from vcan_sim.fleet import Fleet
 
 from .test_replay import a_hand
@@ -102,6 +104,18 @@ def test_with_the_baselines_it_gives_the_fields_of_the_host(
         abs(found[which].displacement_m - field.displacement_m).max() for which, field in wanted.items()
     )
     assert worst_m < 1e-12  # the same codes and baselines; the solver may have begun with another scan
+
+
+@pytest.mark.parametrize("suffix", [".log", ".mcap"])
+def test_a_hand_file_never_replaces_a_journal(recorded: Path, tmp_path: Path, suffix: str) -> None:
+    """The journal knows the baselines and what the host decided; without it, other fields would result."""
+    path = recorded if suffix == ".log" else tmp_path / "run.mcap"
+    if suffix == ".mcap":
+        convert(recorded, path)
+    with pytest.raises(
+        ConfigError, match=r"^--hand: got 'run\.\w+', allowed: only for a log without a journal"
+    ):
+        replay(path, hand=hand_file(tmp_path))
 
 
 def test_frames_of_another_bus_are_left_out(recorded: Path, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
 the prior expects loads mainly at the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
 where they were found (:meth:`LoadPrior.localise`). The skin next to a contact is then estimated to move only
-as far as the loads of the contact require. In tests, expecting loads where they were found reduced
+as far as the contact's loads require. In tests, expecting loads where they were found reduced
 displacement errors by a factor of two to three.
 """
 
@@ -35,9 +35,9 @@ SMOOTH_SHARE: Final = 0.25
 less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
 displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 DISC_SLACK: Final = 0.07
-"""Standard deviation of the displacement that discs cause but no load explains, independently at each
-electrode, relative to the displacement expected there. With 0, an error exceeded five standard deviations in
-one of ten dents; with 0.1, in none of 30."""
+"""Standard deviation of each electrode's independent deviation from the displacement that loads in discs
+cause, relative to the displacement expected there. With 0, an error exceeded five standard deviations in one
+of ten dents; with 0.1, in none of 30."""
 DISC_DOUBT: Final = 2.5
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
 DISC_SHARE: Final = 0.8
@@ -157,7 +157,7 @@ class LoadPrior:
         return True
 
     def set_discs(self, variance: Float, layer: Float, untouched2: float) -> None:
-        """Set the variances of the loads to those of a few loaded cells, and of an untouched skin elsewhere.
+        """Set the load variances: discs add theirs to a few cells of an otherwise untouched skin.
 
         Args:
             variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, pitch².
@@ -184,9 +184,9 @@ class LoadPrior:
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
         """Return the load variances (Q,) for the next solve, pitch².
 
-        Each variance moves halfway from its current value to that of the loads found. With full steps, the
-        variances of neighbouring cells would oscillate. A full step is taken only from equal expected loads,
-        and only if a press is certain.
+        Each variance moves halfway from its current value to the value for the loads found. With full steps,
+        the variances of neighbouring cells would oscillate. A full step is taken only from equal expected
+        loads, and only if a press is certain.
 
         Args:
             found: (Q,) squared loads found in the frame, pitch².

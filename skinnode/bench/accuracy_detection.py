@@ -1,4 +1,4 @@
-"""Measures how reliably the touch detector works, with loads unlike those of its model.
+"""Measures the touch detector's hit and false-alarm rates, with loads unlike those of its model.
 
 The readings come from :class:`skinnode.bench.truth.Skin`, an independent forward model with closed-form
 displacements. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, like a finger pad. A *small sphere*
@@ -154,7 +154,7 @@ def taps(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def slow(seed: int) -> list[dict[str, Any]]:
-    """Return when slow presses are found, whether held presses stay touched, and when creep ends."""
+    """Return how deep slow presses are when found, whether held presses stay touched, and when creep ends."""
     rows: list[dict[str, Any]] = []
     for depth in (0.02, 0.05, 0.1):
         for seconds in RAMPS_S:

@@ -38,7 +38,7 @@ WRONG_MOST: Final = 0.01
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one scene. Sums over coordinates and their counts are pairs: moved, and at rest."""
+    """Result of one scene. Sums and counts over coordinates are pairs: moved coordinates, those at rest."""
 
     family: str
     layout: tuple[str, float]

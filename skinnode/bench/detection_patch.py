@@ -78,7 +78,7 @@ class Patch:
 
 
 def load_of(kind: str, depth: float, layout: PatchLayout, rng: np.random.Generator) -> Load:
-    """Return a random load of one of the :data:`FAMILIES`.
+    """Return a random load of a kind in :data:`skinnode.bench.accuracy_detection.FAMILIES`.
 
     Args:
         kind: Kind of the load.

@@ -1,4 +1,4 @@
-"""Gain drift of a patch: its prior, and the Kalman filter that tracks the gains, in its steady state.
+"""Gain drift of a patch: its prior, and the steady-state Kalman filter that tracks the gains.
 
 The logarithm of each reading contains three gains: those of its upper wire, its lower wire and the patch. The
 patch's gain changes with temperature. Each gain is a random walk. The filter estimates the gains from blocks

@@ -142,7 +142,7 @@ class RestGate:
             self._field = None
 
     def _fits(self, noise: Float | None) -> bool:
-        """Return whether the last frame has the usable readings and the noise of the rest field."""
+        """Return whether the last frame has the same usable readings and noise as the rest field."""
         before = self._noise_of_field
         if (noise is None) != (before is None):
             return False

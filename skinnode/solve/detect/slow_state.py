@@ -31,7 +31,7 @@ HELD_BACK: Final = 2.0
 COARSER: Final = 4.0
 """Ratio of successive ages for which tests are computed."""
 MOST_LEVEL: Final = 12
-"""Maximum level of a test; the age of the gains is then several months."""
+"""Maximum level of a test, for gains that are several months old."""
 FINER: Final = math.sqrt(2.0)
 """Ratio of successive drifts for which tests are computed."""
 PRIOR: Final = 8.0
@@ -123,7 +123,7 @@ class SlowState:
         return self.test_at(self._level)
 
     def test_at(self, level: int) -> TouchTest:
-        """Return the test for gains of an age of :data:`HELD_BACK` blocks, times 4 to the power ``level``."""
+        """Return the test for gains that are :data:`HELD_BACK` · 4^``level`` blocks old."""
         seconds = self._base * self._patch.period_s * COARSER**level
         return touch_test(self._patch, self._drift, self._patch_drift, seconds)
 
@@ -175,7 +175,7 @@ class SlowState:
             self._released += 1
 
     def _grow(self) -> bool:
-        """Adapt the level to the age of the gains; return whether it changed."""
+        """Adapt the level to the age of the gains; return whether the level changed."""
         if self.age <= self._base and self._covariance is None:
             return False
         covariance = self._filter.steady if self._covariance is None else self._covariance
@@ -208,7 +208,7 @@ class SlowState:
         """Continue with the gains and expected changes of the same stream at a different noise.
 
         Args:
-            gains: (U + K + 1,) relative changes of conductance; see :attr:`gains`.
+            gains: (U + K + 1,) relative changes in conductance; see :attr:`gains`.
             expected: (U, K) expected changes, in units of the noise.
         """
         self._gains = gains / self._unit
@@ -285,7 +285,7 @@ class SlowState:
             self._set_drift(drift, patch_drift)
 
     def _chosen(self, used: float, stated: float, measured: float, std: float) -> float:
-        """Return the drift (standard deviation in an hour) to assume.
+        """Return the drift (standard deviation in one hour) to assume.
 
         Args:
             used: Currently assumed drift.

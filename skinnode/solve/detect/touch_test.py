@@ -12,9 +12,8 @@ With the eigenvectors u_i and eigenvalues μ_i of Bᵀ V₀⁻¹ B, T is the sum
 of G are g_i = (1 + μ_i)^−½ V₀⁻¹ B u_i. Without a touch, the z_i are independent with the variances d_i =
 μ_i / (1 + μ_i), so T has the distribution of :mod:`skinnode.solve.detect.weighted_chi_squared`.
 
-The odds of touch allow for depths c times as large, for which c² μ_i replaces μ_i. The log
-likelihood ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)), and all octaves of c are
-equally likely.
+The odds of touch allow for depths c times as large, for which c² μ_i replaces μ_i. The log likelihood ratio
+is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)). All octaves of c are equally likely.
 
 In the mean of w successive frames, the squared signal-to-noise ratio of a touch is w times that of one frame,
 because noise is independent from frame to frame. The errors of the gains are not independent, so the mean has

@@ -16,7 +16,7 @@ import numpy as np
 from skinnode.model.layout import Float
 
 _STEPS: Final = 200
-"""Maximum number of steps in each iteration; 5 to 60 are typical."""
+"""Maximum number of steps in each search; 5 to 60 are typical."""
 _TOLERANCE: Final = 1e-6
 """Relative error of the probability at which the search for a quantile ends."""
 

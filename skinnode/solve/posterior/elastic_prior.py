@@ -102,7 +102,7 @@ def _elastic_prior(layout: PatchLayout, rubber: Rubber) -> ElasticPrior:
 
 
 def bonded_response(layout: PatchLayout) -> Float:
-    """Return the response (3UN, Q) of a bonded layer to normal loads, pitches per unit load.
+    """Return the response (3UN, Q) of a bonded layer to normal loads, in pitches per unit load.
 
     The layer is incompressible, and its thickness equals the height of the electrodes. This support differs
     from a half-space more than any other: around a contact, the surface moves sideways, away from the

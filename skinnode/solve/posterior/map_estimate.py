@@ -148,7 +148,7 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest, and expect equal loads everywhere with s² = ``scale2``, pitch².
+        """Return to rest, and expect equal loads everywhere with s² = ``scale2`` in pitch².
 
         The memory of the factors is freed, so that a hand needs memory only for the patches in contact.
         """
@@ -211,7 +211,7 @@ class MapEstimator:
         return self._settle(observation) or self.track(observation, members)
 
     def step_s(self, observation: Observation) -> float:
-        """Measure the time to factorise the equations of all wires and compute the standard deviations, s.
+        """Return the time in s to factorise the equations of all wires and compute the standard deviations.
 
         The factors are discarded.
         """
@@ -252,15 +252,15 @@ class MapEstimator:
         return square + prior + float((g**2 / observation.d).sum())
 
     def roughness(self, moved: Float) -> float:
-        """Return uᵀ C⁻¹ u, pitch², for a displacement u (U, 3N)."""
+        """Return uᵀ C⁻¹ u, in pitch², for a displacement u (U, 3N)."""
         return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
 
     def free_displacement(self) -> Float:
-        """Return the free coordinates (U f,) of the current displacement, pitches."""
+        """Return the free coordinates (U f,) of the current displacement, in pitches."""
         return np.ascontiguousarray(self.moved[:, self._free]).ravel()
 
     def covariance(self) -> Float:
-        """Return the posterior covariance (U f, U f) of the displacement, pitch²."""
+        """Return the posterior covariance (U f, U f) of the displacement, in pitch²."""
         v = self._b.whitened[: self.factored_rows]
         explained = np.empty_like(self.load_prior.covariance)
         multiply(np.ascontiguousarray(v.T), v, explained)

@@ -38,7 +38,7 @@ BEYOND: Final = 1
 AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
-"""Radius around the start of a search within which loads are computed, cells."""
+"""Radius around the start of a search within which the effects of loads are computed, cells."""
 MOST: Final = 4
 """Number of discs at which the search is abandoned. Loads that need so many discs are not local."""
 WIDE: Final = 3.0
@@ -171,7 +171,7 @@ class _Search:
         self.evidence = 0.0
 
     def start(self, discs: Float) -> Float:
-        """Return the discs of the last frame, improved for this frame."""
+        """Return the discs of the last frame, refitted to this frame."""
         if not len(discs):
             return discs
         self._include(discs[:, :2])

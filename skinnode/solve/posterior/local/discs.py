@@ -8,16 +8,16 @@ a² β² w to the layer load, where
 
     w = 1 / (1 + exp((r − R − ¼) / ¼)),   r: distance of the cell from the centre
 
-All discs together give the loads the variances v. Let b = BᵀL⁻¹y and M = BᵀB, where B = L⁻¹ J G are the
-whitened effects of the loads on the data y, and L Lᵀ is the covariance of the data of an untouched skin. By
-the Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an
+Let v be the variances of the loads, summed over all discs, b = BᵀL⁻¹y and M = BᵀB. Here, B = L⁻¹ J G are
+the whitened effects of the loads on the data y, and L Lᵀ is the data covariance of an untouched skin. By the
+Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an
 untouched skin by
 
     ½ |Λ⁻¹ V b|² − ln |Λ|,   Λ Λᵀ = I + V M V,   V = diag(√v)
 
 No eigenvalue of I + V M V is less than 1, so the factorisation is as accurate as that of the innovation
-covariance (:mod:`skinnode.solve.posterior.measurement_update`). Its size is four times the number of loaded
-cells, regardless of the size of the patch.
+covariance (:mod:`skinnode.solve.posterior.measurement_update`). The matrix size is four times the number
+of loaded cells, regardless of the size of the patch.
 """
 
 from __future__ import annotations

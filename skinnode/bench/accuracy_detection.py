@@ -1,13 +1,13 @@
-"""Measures what the touch detector finds, and how often it errs, with loads unlike those of its model.
+"""Measures the touch detector's hit and false-alarm rates, with loads unlike those of its model.
 
-The readings come from :class:`skinnode.bench.truth.Skin`, a forward model of its own, with displacements in
-closed form. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, as a finger pad has. A *small sphere*
-has a radius of 1.5 to 3.5 pitches itself: pressed 2 % deep into a layer of half a pitch, it touches a disc of
-0.1 to 0.2 pitches, which changes the readings less than noise does. The column ``signal`` shows the norm of
-the change in units of the noise. A detector that knows the load, its place and its size beforehand needs a
-signal of 3.6 to find 95 % within three frames (``REACHABLE``).
+The readings come from :class:`skinnode.bench.truth.Skin`, an independent forward model with closed-form
+displacements. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, like a finger pad. A *small sphere*
+has a sphere radius of 1.5 to 3.5 pitches. Pressed 2 % deep into a layer of half a pitch, it has a contact
+radius of 0.1 to 0.2 pitches, and changes the readings less than noise does. The column ``signal`` shows the
+norm of the change in the readings, in units of the noise. A detector that knows the load, its place and its
+size in advance needs a signal of 3.6 to find 95 % of the presses within three frames (``REACHABLE``).
 
-The false alarms are those of the detector itself, frame by frame, while the gains of all wires drift.
+False alarms are counted frame by frame at the output of the detector, while the gains of all wires drift.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ PITCH_M: Final = 4e-3
 NOISE: Final = 1e-3
 LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
 DRIFTS: Final = ("steady", "walk")
-"""Drifts of the gains of all wires: at a constant rate of 1 % an hour up or down, or as random walks with a
-standard deviation of 1 % after an hour."""
+"""Gain drifts of all wires: a constant rate of 1 % per hour up or down, or random walks with a standard
+deviation of 1 % after one hour."""
 FAMILIES: Final = (
     ("blunt sphere", 0.01),
     ("blunt sphere", 0.02),
@@ -43,18 +43,18 @@ FAMILIES: Final = (
     ("edge", 0.05),
     ("whole patch", 0.02),
 )
-"""Kinds of loads and their depths, in layer heights."""
+"""Load families as (kind, depth in layer heights)."""
 REQUIRED: Final = (("blunt sphere", 0.02), ("dent", 0.05))
-"""Loads that must be found in :data:`FOUND` of the cases, within three frames."""
+"""Loads of which a fraction :data:`FOUND` must be found within three frames."""
 FOUND: Final = 0.95
 WITHIN: Final = 3
 REACHABLE: Final = 3.6
-"""Signal at which the mean of three frames exceeds the 4.6 standard deviations of a false alarm in 450,000
-frames with a probability of 95 %: (4.6 + 1.64) / √3."""
+"""Signal at which the mean of three frames exceeds 4.6 standard deviations with a probability of 95 %:
+(4.6 + 1.64) / √3. Noise exceeds 4.6 standard deviations in one of 450,000 frames."""
 TAPS: Final = (1, 2, 3)
 """Durations of taps, in scans."""
 RAMPS_S: Final = (1.0, 3.0, 10.0, 30.0, 100.0)
-"""Durations in which a slow press reaches its depth, s."""
+"""Times in which a slow press reaches its full depth, s."""
 HOLD_S: Final = 600.0
 DETECTOR_US: Final = 20.0
 
@@ -65,7 +65,7 @@ def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
     Args:
         seed: Seed of all random numbers.
         presses: Number of presses for each load, layout and drift.
-        hours: Patch-hours at rest for the false alarms at the default rate.
+        hours: Hours of one patch at rest in which false alarms are counted at the default rate.
     """
     figures: dict[str, Any] = {
         "benchmark": "accuracy detection",
@@ -91,7 +91,7 @@ def _patch(seed: int, preset: str, height: float, noise: float, drift: str, **op
 
 
 def found(seed: int, presses: int) -> list[dict[str, Any]]:
-    """Return the share of presses found within one to four frames, for each layout, drift and load."""
+    """Return the fraction of presses found within one to four frames, for each layout, drift and load."""
     rows = []
     for preset, height in LAYOUTS:
         for drift in DRIFTS:
@@ -129,7 +129,7 @@ def found(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def taps(seed: int, presses: int) -> list[dict[str, Any]]:
-    """Return the share of short taps found, by their duration in scans."""
+    """Return the fraction of short taps found, for each load and duration in scans."""
     rows = []
     patch = _patch(seed, "staggered", 0.5, NOISE, "steady")
     for kind, depth in (
@@ -154,7 +154,7 @@ def taps(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def slow(seed: int) -> list[dict[str, Any]]:
-    """Return when slow presses are found, and whether long ones and creep end as they should."""
+    """Return how deep slow presses are when found, whether held presses stay touched, and when creep ends."""
     rows: list[dict[str, Any]] = []
     for depth in (0.02, 0.05, 0.1):
         for seconds in RAMPS_S:
@@ -207,7 +207,7 @@ def slow(seed: int) -> list[dict[str, Any]]:
 
 
 def alarms(seed: int, hours: float) -> list[dict[str, Any]]:
-    """Count the false alarms of the detector at rest, at the default rate and at a rate that shows errors."""
+    """Count the detector's false alarms at rest, at the default rate and at a rate that reveals errors."""
     rows = []
     wanted = [(NOISE, "steady", FALSE_ALARMS_PER_HOUR, hours)]
     wanted += [
@@ -236,7 +236,7 @@ def alarms(seed: int, hours: float) -> list[dict[str, Any]]:
 
 
 def roc(seed: int, presses: int) -> list[dict[str, Any]]:
-    """Return the share of presses found in one frame and in three, against the rate of false alarms."""
+    """Return the fraction of presses found in one and in three frames, for each rate of false alarms."""
     from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
     patch = _patch(seed, "staggered", 0.5, NOISE, "steady")
@@ -282,7 +282,7 @@ def roc(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def times(seed: int) -> dict[str, Any]:
-    """Return the time of the detector per frame at rest, µs."""
+    """Return the detector's time per frame at rest, in µs."""
     patch = _patch(seed, "staggered", 0.5, NOISE, "steady")
     shape = patch.rest_ohm.shape
     frames = [patch.rest_ohm * (1.0 + NOISE * patch.rng.standard_normal(shape)) for _ in range(400)]
@@ -313,7 +313,7 @@ def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
             )
             must.append(_must(what, share, f"at least {FOUND:.0%}", share >= FOUND))
     for row in figures["alarms"]:
-        # three standard deviations of the expected number
+        # three standard deviations above the expected number
         expected = row["set_per_hour"] * row["hours"]
         limit = expected + 3.0 * math.sqrt(expected)
         what = f"false alarms in {row['hours']:g} h, noise {row['noise']:.0e}, {row['drift']} drift"

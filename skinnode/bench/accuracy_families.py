@@ -1,4 +1,4 @@
-"""Measures the posterior on families of loads that its prior does not expect, with and without discs.
+"""Measures the posterior's accuracy for loads that its prior does not expect, with and without discs.
 
 Each scene is one frame, solved from rest. A coordinate counts as moved if it moves by at least a tenth of
 the largest displacement of its scene; all others are at rest. "Error over claim" is the RMS error divided by
@@ -28,7 +28,7 @@ from skinnode.solve.posterior.posterior import Posterior
 LAYOUTS: Final = (("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0))
 SIGMAS: Final = (1e-5, 1e-4, 1e-3, 3e-3)
 MOVED: Final = 0.1
-"""Displacement of a moved coordinate, relative to the largest displacement of its scene."""
+"""Minimum displacement of a moved coordinate, relative to the largest displacement of its scene."""
 FAR: Final = 5.0
 """Error, in standard deviations, beyond which a scene counts as wrong."""
 RATIOS: Final = (0.85, 1.1)
@@ -38,7 +38,7 @@ WRONG_MOST: Final = 0.01
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one scene. Pairs refer to moved coordinates and coordinates at rest."""
+    """Result of one scene. Sums and counts over coordinates are pairs: moved coordinates, those at rest."""
 
     family: str
     layout: tuple[str, float]
@@ -46,7 +46,7 @@ class Sample:
     bonded: bool
     converged: bool
     error: float
-    """‖u − u*‖ / ‖u*‖."""
+    """Relative error of the displacement, ‖u − u*‖ / ‖u*‖."""
     square: tuple[float, float]
     """Sum of squared errors, m²."""
     claim: tuple[float, float]
@@ -58,11 +58,11 @@ class Sample:
     worst: float
     """Largest error, in standard deviations."""
     contacts: tuple[int, int]
-    """Number of contacts found, and of loads."""
+    """Number of contacts found, and number of loads."""
     force: tuple[float, float]
-    """Error of the total normal force and its standard deviation, N; NaN if unknown or without contacts."""
+    """Error of the total normal force, and its standard deviation, N; NaN if unknown or without contacts."""
     centroid: tuple[float, float]
-    """Distance of a single contact from a single load, and its standard deviation, m; NaN otherwise."""
+    """Distance from the only contact to the only load, and its standard deviation, m; otherwise NaN."""
     seconds: float
     """Processor time, s."""
 
@@ -104,7 +104,7 @@ def _pair(values: Iterable[Any]) -> tuple[Any, Any]:
 
 
 def row(samples: list[Sample]) -> dict[str, Any]:
-    """Return the statistics of several scenes; those that did not converge only count as such."""
+    """Return the statistics of several scenes. Scenes that did not converge enter only counts and time."""
     kept = [each for each in samples if each.converged]
     square, claim, inside, count = (
         np.array([getattr(each, name) for each in kept], np.float64).reshape(-1, 2)
@@ -152,7 +152,7 @@ def run(scenes: int, echo: Callable[[str], object] = lambda _: None) -> dict[str
 
     Args:
         scenes: Number of scenes of each family for each layout and noise.
-        echo: Function that prints a line about the progress.
+        echo: Function that prints a progress line.
 
     Returns:
         One row per prior, layout, noise and family, and one per prior and family over all layouts and noises.
@@ -197,7 +197,7 @@ def _solve(prior: str, layout: tuple[str, float], sigma: float, scenes: int) -> 
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement on the prior with discs: name, value, limit, and whether it is met."""
+    """Return one row per requirement for the prior with discs: name, value, limit, and whether it is met."""
     found = []
     for each in figures["families"]:
         if each["prior"] != "discs":

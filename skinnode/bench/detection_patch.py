@@ -1,4 +1,4 @@
-"""Simulated patch with drifting gains and its touch detector, for the benchmark of the detection."""
+"""Simulated patch with drifting gains and its touch detector, for the detection benchmark."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DRIFT: Final = 0.01
 
 @dataclass(eq=False)
 class Patch:
-    """A simulated patch with drifting gains, and its detector."""
+    """Simulated patch with drifting gains, and its touch detector."""
 
     layout: PatchLayout
     noise: float
@@ -61,12 +61,12 @@ class Patch:
         return bool(self.detector.see(noisy * (1.0 + self._upper) * (1.0 + self._lower)).touched)
 
     def rest(self, frames: int) -> None:
-        """Pass frames of the untouched patch."""
+        """Pass frames of the untouched patch to the detector."""
         for _ in range(frames):
             self.see(self.rest_ohm)
 
     def settle(self) -> None:
-        """Let go for five seconds; forget the stream if the touch does not end, and learn its drift again."""
+        """Release the patch for five seconds; if the touch does not end, reset and retrain the detector."""
         self.rest(64)
         if self.detector.touched:
             self.detector.reset()
@@ -78,7 +78,7 @@ class Patch:
 
 
 def load_of(kind: str, depth: float, layout: PatchLayout, rng: np.random.Generator) -> Load:
-    """Choose a random load of one of the :data:`FAMILIES`.
+    """Return a random load of a kind in :data:`skinnode.bench.accuracy_detection.FAMILIES`.
 
     Args:
         kind: Kind of the load.

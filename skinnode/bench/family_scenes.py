@@ -1,4 +1,4 @@
-"""Scenes for the families of ``skinnode bench accuracy``: loads that violate the assumptions of the prior.
+"""Scenes for the families of ``skinnode bench accuracy``: loads that violate the prior's assumptions.
 
 Half of the scenes are closed-form loads on a half-space (:mod:`skinnode.bench.trust_loads`). In the other
 half, a rigid body presses on a bonded layer of the simulator (:mod:`vcan_sim.contact`), which shares no code
@@ -30,11 +30,11 @@ THICKNESSES: Final = (1.0, 2.0, 4.0)
 APART: Final = (3.0, 6.0)
 """Minimum and maximum distance between two presses, pitches."""
 FINE: Final = 3
-"""Number of cells of the simulator per pitch."""
+"""Number of simulator cells per pitch."""
 MARGIN: Final = 3
 """Width of the simulated skin beyond the outermost electrodes, pitches."""
 CLOSE: Final = 1e-4
-"""Largest gap or overlap in a simulated contact, relative to the depth."""
+"""Maximum gap or overlap in a simulated contact, relative to the depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Scene:
     centers_m: tuple[tuple[float, float], ...]
     """Centre of each load, m."""
     force_n: Float
-    """(3,) total force, N; NaN if it is unknown."""
+    """(3,) total force, N; NaN if unknown."""
     bonded: bool
     """Whether the skin is a bonded layer of the simulator."""
 
@@ -61,7 +61,7 @@ def draw(
         skin: Patch to press.
         rng: Random generator.
         bonded: Whether the body presses on a bonded layer; only for the families in :data:`BONDED`.
-        depth: Depth divided by the height of the upper layer; by default, it is random.
+        depth: Depth divided by the height of the upper layer; random by default.
     """
     layout = skin.layout
     loads: tuple[Load, ...] = (
@@ -76,7 +76,7 @@ def draw(
 
 
 def _pair(layout: PatchLayout, rng: np.random.Generator, depth: float | None) -> tuple[Load, Load]:
-    """Return two spheres at a distance within :data:`APART`."""
+    """Return two spheres whose distance is within :data:`APART`."""
     while True:
         first, second = (trust_loads.draw("sphere", layout, rng, depth) for _ in range(2))
         gap = np.subtract(second.center_m, first.center_m)

@@ -78,9 +78,9 @@ class Experiment:
     layout: PatchLayout
     """Layout of the single wire."""
     samples_ohm: Float
-    """(SAMPLES, 1, K), resistances of the wire, ohm."""
+    """(SAMPLES, 1, K) resistances of the wire, ohm."""
     truth_m: Float
-    """(1, N, 3), true displacement at the last sample, metres."""
+    """(1, N, 3) true displacement at the last sample, metres."""
     patch: PatchLayout
     press: Press
 
@@ -171,7 +171,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """Solve all experiments with one step control; return their mean cost and accuracy."""
+    """Solve all experiments with one step control, and return their mean cost and accuracy."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()
@@ -211,7 +211,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself, excluding those of cycle search, second attempts and checks."""
+    """Return the rows of the path itself, excluding the cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -221,19 +221,19 @@ def _final(path: PathResult) -> float:
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
-    """Return the data of figure 8: mean number of calls in each step except the last."""
+    """Return the mean number of calls in each step except the last (figure 8)."""
     paths = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     return [float(each) for each in np.mean([path.evaluations[: samples - 1, 0] for path in paths], axis=0)]
 
 
 def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
-    """Return the data of figures 9 and 10: first-order optimality after each step except the last."""
+    """Return the first-order optimality after each step except the last (figures 9 and 10)."""
     path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
     return [float(each) for each in path.optimality[: samples - 1, 0]]
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median length of the cycles found in the experiments; None if no cycle was found."""
+    """Return the median cycle length over the experiments; None if no cycle was found."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -244,7 +244,7 @@ def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | No
 
 
 def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
-    """Return the data of figure 11: operator steps per path, and per sample of the first experiment."""
+    """Return the operator steps per path, and per sample of the first experiment (figure 11)."""
     uniform = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     periodic = [one.solve(Periodic(plain=True), samples=samples) for one in made]
     return {
@@ -258,7 +258,7 @@ def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
 
 
 def _last_step(one: Experiment, periodic: bool) -> list[float]:
-    """Return the data of figure 12: optimality at the start and after each iteration of the last step."""
+    """Return the optimality at the start of the last step and after each of its iterations (figure 12)."""
     cycle = one.solve(Periodic(plain=True), samples=50).cycle if periodic else None
 
     def schedule(most: int) -> Schedule:
@@ -299,7 +299,7 @@ def _ten_steps() -> list[dict[str, Any]]:
     """Measure the time and error of a ten-step path on the layout ``staggered``.
 
     The first rows solve one wire with each operator; the next row uses our default step control. The last row
-    is the time per wire of solving the whole patch of ten wires.
+    is the time per wire when the whole patch of ten wires is solved.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
@@ -331,7 +331,7 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Return the data of figure 13: z-displacement of the whole patch in the hardest setting, µm.
+    """Return the z-displacements of the whole patch in the hardest setting, in µm (figure 13).
 
     The patch is solved in 5 and in 20 steps, as in the paper, and with our adaptive step control.
     """

@@ -162,17 +162,17 @@ class FieldFrame:
     """(U, N, 3) fraction of each displacement that is determined by the data of this scan rather than by the
     prior: 1 minus the ratio of the posterior variance to the prior variance. None if all fractions are 1."""
     touched: bool | None = None
-    """Whether the detector finds the patch touched; None if it is switched off, or if less than half of the
-    readings are usable. A touch begins and ends once: it lasts until four scans on average agree with rest.
-    Noise alone reports a touch ``false_alarms_per_hour`` times an hour at most."""
+    """Whether the detector reports a touch; None if the detector is switched off, or if less than half of the
+    readings are usable. A touch lasts without a break until the mean of four scans agrees with rest. Noise
+    alone causes at most ``false_alarms_per_hour`` reports per hour."""
     touch_odds: float | None = None
-    """Odds of touch to no touch, given the readings of this scan and the odds after the scan before; inf if
-    too large for a float, None without detection. They are the ratio of two probability densities of the
-    readings times the prior odds. Without a touch, the readings differ from rest by noise and by drift of the
-    gains. With a touch, independent loads on all cells displace the skin as well; every octave of their
-    depth, from one that noise hides to 16 % of the layer height (RMS), is equally likely. The prior is a
-    chain of two states, with one touch a minute that lasts a second on average. The odds do not decide
-    ``touched``, which obeys the stated number of false alarms instead."""
+    """Odds of touch to no touch, given the readings of this scan and the odds after the previous scan; inf if
+    too large for a float, None without detection. The odds are the likelihood ratio of the readings times the
+    prior odds. Without a touch, the readings differ from rest by noise and gain drift. With a touch,
+    independent loads on all cells also displace the skin; all octaves of their depth, from a depth that noise
+    hides to 16 % of the layer height (RMS), are equally likely. The prior is a two-state Markov chain, with
+    one touch per minute that lasts one second on average. The odds do not determine ``touched``, which
+    depends on the accepted number of false alarms instead."""
     faults: tuple[DataFault, ...] = ()
     """Readings that failed a test and were not used to compute the field."""
 

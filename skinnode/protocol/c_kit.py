@@ -1,7 +1,7 @@
-"""C99 kit: the scans of a patch for firmware of a board and for foreign masters.
+"""Generates the C99 kit, with which board firmware packs scans and foreign masters assemble them.
 
 The kit has three files. ``skinnode_patch.h`` and ``skinnode_patch.c`` are the same for every patch and are
-kept as C files in the folder ``c``, so that they can be read, checked and compiled as they are. All sizes,
+kept as C files in the folder ``c``, so that they can be read, checked and compiled directly. All sizes,
 indices and codes are in ``skinnode_patch_config.h``, which this module generates from the profile.
 """
 
@@ -35,7 +35,7 @@ CONFIG_NAME: Final = "skinnode_patch_config.h"
 FIXED_NAMES: Final = ("skinnode_patch.h", "skinnode_patch.c")
 """Names of the files that do not depend on the patch."""
 MARK: Final = "/* Written by skinnode eds --c."
-"""Text with which each file begins. Only files with this mark are overwritten."""
+"""Text at the beginning of each file. Only files with this text are overwritten."""
 
 _OBJECTS: Final = {
     "DESCRIPTOR": (
@@ -59,7 +59,7 @@ _OBJECTS: Final = {
     "COORDINATES": "",
     "BASELINE_DOMAIN": "",
 }
-"""Names in :mod:`skinnode.canopen.indices` of the manufacturer objects and their sub-indices."""
+"""Manufacturer objects and their sub-indices, as named in :mod:`skinnode.canopen.indices`."""
 
 _COORDINATE_BYTES: Final = 12
 """Bytes per line of the generated array: the coordinates of one electrode."""
@@ -68,7 +68,7 @@ _Macros = dict[str, str | int]
 
 
 def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[str, str]:
-    """Return the content of each file of the kit, by file name.
+    """Return the content of the kit's files, by file name.
 
     Args:
         profile: sizes of the patch.
@@ -80,7 +80,7 @@ def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[
 
 
 def may_replace(file: Path) -> bool:
-    """Return whether a file of the kit may be written: there is none yet, or it begins with :data:`MARK`.
+    """Return whether a kit file may be written: it does not exist yet, or it begins with :data:`MARK`.
 
     Args:
         file: path of the file.
@@ -213,7 +213,7 @@ def _values(profile: PatchProfile) -> _Macros:
 
 
 def _layout(layout: PatchLayout) -> str:
-    """Return the layout's macros, and its coordinates for the one source file that asks for them."""
+    """Return the layout's macros, and its coordinates for the source file that requests them."""
     (resistivity,) = struct.unpack("<I", struct.pack("<f", layout.resistivity_ohm_per_m))
     coordinates = pack_coordinates(layout)
     rows = [coordinates[at : at + _COORDINATE_BYTES] for at in range(0, len(coordinates), _COORDINATE_BYTES)]

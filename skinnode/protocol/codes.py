@@ -2,7 +2,7 @@
 
 A resistance R is encoded as the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)), rounded from the exact
 value, with ties to the even code, so that every implementation can compute the same code. Codes from 0 to
-2ⁿ − 4 are measurements. The three codes above are reserved for over-range, short and open, in this order. A
+2ⁿ − 4 are measurements. The three codes above are reserved for over-range, short and open, in this order. The
 host decodes live streams with the compiled function ``skinnode.solve.wires.decode``.
 """
 
@@ -35,7 +35,7 @@ class CodeScale:
     """Mapping of R/R0 to codes. ``lo`` and ``hi`` are rounded to REAL32, as in the object dictionary.
 
     Raises:
-        ConfigError: if the code width is neither 16 nor 24 bits, or unless 0 ≤ lo < hi < ∞.
+        ConfigError: if the code width is neither 16 nor 24 bits, or if 0 ≤ lo < hi < ∞ does not hold.
     """
 
     bits: int = 16
@@ -81,10 +81,10 @@ class CodeScale:
 
     @functools.cached_property
     def position_error(self) -> float:
-        """Bound of the rounding error of (R/R0 − lo) / step in double precision, codes.
+        """Bound on the rounding error of (R/R0 − lo) / step in double precision, codes.
 
-        R/R0 and its difference to ``lo`` are relative to ``hi``, the division and the step to the code. The
-        bound is twice the sum of these four errors.
+        The errors of R/R0 and of its difference from ``lo`` are relative to ``hi``. The errors of the step
+        and of the division are relative to the code. The bound is twice the sum of these four errors.
         """
         return self.steps * (2.0 * self.hi / (self.hi - self.lo) + 2.0) * 2.0**-52
 
@@ -139,11 +139,11 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
 def _round_exactly(
     code: Float, near_tie: NDArray[np.bool_], resistance: Float, baseline: Float, scale: CodeScale
 ) -> Float:
-    """Return the codes, with those near a tie rounded in exact arithmetic.
+    """Return the codes, rounded in exact arithmetic where they are near a tie.
 
     Args:
         code: rounded positions in the code range; any shape.
-        near_tie: mask of the positions for which double precision cannot decide how to round.
+        near_tie: mask of the positions that cannot be rounded reliably in double precision.
         resistance: resistances, ohm; broadcastable to the shape of ``code``.
         baseline: R0, ohm; broadcastable to the shape of ``code``.
         scale: mapping of R/R0 to codes.

@@ -130,8 +130,8 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
     """
     if path.suffix not in FRAME_FILES:
         raise ConfigError("recording", str(path), ALLOWED)
+    _require_no_journal(path)
     frames: Frames = McapReader(path) if path.suffix == MCAP else FrameLogReader(path)
-    _require_no_journal(path, frames)
     guests = tuple(bus.model_copy(update={"role": "guest"}) for bus in hand.buses)
     hand = hand.model_copy(update={"buses": guests})
     events: list[dict[str, Any]] = []
@@ -173,12 +173,13 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
     )
 
 
-def _require_no_journal(path: Path, frames: Frames) -> None:
+def _require_no_journal(path: Path) -> None:
     """Raise ConfigError if a log has a journal, whose hand and events would otherwise be ignored."""
-    journal = path.with_suffix(SUFFIX)
-    inside = isinstance(frames, McapReader) and any(frames.journal())
-    if inside or (not isinstance(frames, McapReader) and journal.exists()):
-        where = path.name if inside else journal.name
+    if path.suffix == MCAP:
+        found, where = any(McapReader(path).journal()), path.name
+    else:
+        found, where = path.with_suffix(SUFFIX).exists(), path.with_suffix(SUFFIX).name
+    if found:
         raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} has the hand")
 
 

@@ -55,10 +55,10 @@ class EstimateOptions:
             noise.
         deadline_us: Time limit of an update, µs; an update can exceed it by the time of one solver step.
             Wires that are unsolved at the deadline have the status DEADLINE.
-        prior: Where the posterior expects loads once it has found a touch: ``cells`` for one variance per
-            cell, or ``discs`` for a few soft discs, which the evidence of the frame determines. With
+        prior: Prior of the loads after the posterior has found a touch: ``cells`` for one variance per cell,
+            or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
-            the loads are not local, ``discs`` uses ``cells``.
+            the loads are not local, ``discs`` falls back to ``cells``.
 
     Raises:
         ValueError: If an option is out of range.
@@ -137,11 +137,11 @@ class TrackerOptions(EstimateOptions):
             on the layout and the noise (:mod:`skinnode.solve.precision`).
         max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N. The
             default depends on the layout and the rubber, and applies only to calibrated forces.
-        detect: Whether to detect touch before solving (:mod:`skinnode.solve.detect`). An untouched patch is
+        detect: Whether to detect touches before solving (:mod:`skinnode.solve.detect`). An untouched patch is
             then not solved, unless ``hold`` is off or ``estimate_noise`` is on.
-        false_alarms_per_hour: Accepted number of touches that noise alone reports in an hour.
-        scan_period_s: Time between two frames, s. The detector needs it for the drift of the gains and for
-            the number of false alarms.
+        false_alarms_per_hour: Accepted number of touches per hour that are reported because of noise alone.
+        scan_period_s: Time between successive frames, s. The detector uses this time to model gain drift and
+            to limit the number of false alarms.
 
     Raises:
         ValueError: If an option is out of range.

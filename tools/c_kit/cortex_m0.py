@@ -1,7 +1,7 @@
-"""Runs functions of a Cortex-M0+ program, and counts their cycles.
+"""Runs functions of a Cortex-M0+ program and counts their cycles.
 
-Cycles are those of the technical reference manual (Arm DDI 0484C, table 3-1) without wait states and with the
-multiplier of one cycle.
+Cycle counts follow the technical reference manual (Arm DDI 0484C, table 3-1), without wait states and with
+the single-cycle multiplier.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ RETURN = 0x7000_0000
 
 
 class CortexM0:
-    """A Cortex-M0+ with a program.
+    """Emulated Cortex-M0+ with a program.
 
     Args:
-        elf: program, linked to :data:`FLASH` and :data:`RAM`, without initialised data.
+        elf: program linked to :data:`FLASH` and :data:`RAM`, without initialised data.
     """
 
     def __init__(self, elf: Path) -> None:
@@ -42,7 +42,7 @@ class CortexM0:
         self._branch_from: int | None = None
 
     def call(self, function: str) -> tuple[int, int]:
-        """Call a function without arguments; returns its cycles, and its stack in bytes."""
+        """Call a function without arguments; return its cycles, and its stack use in bytes."""
         self._cycles, self._lowest, self._branch_from = 0, STACK, None
         self._machine.reg_write(arm_const.UC_ARM_REG_SP, STACK)
         self._machine.reg_write(arm_const.UC_ARM_REG_LR, RETURN | 1)
@@ -50,17 +50,17 @@ class CortexM0:
         return self._cycles, STACK - self._lowest
 
     def word(self, symbol: str, offset: int) -> int:
-        """Return 32 bits of a variable."""
+        """Return a 32-bit word of a variable."""
         return int.from_bytes(self._machine.mem_read(self._symbols[symbol] + offset, 4), "little")
 
     def _on_instruction(self, machine: unicorn.Uc, at: int, size: int, _: object) -> None:
         if self._branch_from is not None and at != self._branch_from + 2:
-            self._cycles += 1  # a conditional branch that was taken
+            self._cycles += 1  # the conditional branch was taken
         self._branch_from = None
         self._lowest = min(self._lowest, machine.reg_read(arm_const.UC_ARM_REG_SP))
         code = int.from_bytes(machine.mem_read(at, 2), "little")
         if size == 4:
-            self._cycles += 3  # BL; barriers and MRS take as long
+            self._cycles += 3  # BL; barriers and MRS take equally long
             return
         if code >> 12 == 0b1101:
             self._branch_from = at
@@ -68,7 +68,7 @@ class CortexM0:
 
 
 def cycles_of(code: int) -> int:
-    """Return the cycles of a 16-bit instruction; of a conditional branch if it is not taken."""
+    """Return the cycles of a 16-bit instruction; a conditional branch counts as not taken."""
     top = code >> 11
     if code >> 9 in (0b1011010, 0b1011110):  # PUSH, POP
         registers = (code & 0xFF).bit_count()

@@ -13,11 +13,11 @@ LINES: Final = {
     "largest χ² of a wire": ("tab:orange", "--"),
     "known load": ("tab:gray", ":"),
 }
-"""Colour and style of each detector."""
+"""Line colour and style of each detector."""
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Plot the share of presses found against the rate of false alarms (ROC), and write it to ``file``."""
+    """Plot the fraction of presses found against the false-alarm rate (ROC); write the plot to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -73,7 +73,7 @@ static uint16_t skn_get_u16(const uint8_t *bytes)
 
 /* --- scan check */
 
-/* One byte of a CRC with polynomial 0x1021, without a table. */
+/* Extend a CRC with polynomial 0x1021 over one byte, without a table. */
 static uint16_t skn_crc_byte(uint16_t crc, uint8_t byte)
 {
     uint32_t value = (((uint32_t)crc << 8) | ((uint32_t)crc >> 8)) & 0xFFFFu;
@@ -136,7 +136,7 @@ SKN_API uint32_t skn_real32(uint64_t value, uint8_t fraction_bits)
 
         fraction = value >> cut;
         if ((rest > half) || ((rest == half) && ((fraction & 1u) != 0u))) {
-            fraction++; /* may carry into the exponent, which is then right too */
+            fraction++; /* may carry into the exponent, which is then also correct */
         }
     }
     return (((highest + SKN_REAL32_BIAS) - fraction_bits) << SKN_REAL32_FRACTION_BITS) +
@@ -181,9 +181,9 @@ SKN_API skn_code_t skn_encode(uint32_t resistance, uint8_t fraction_bits, uint32
         code = SKN_CODE_SHORT;
     } else if ((exponent == 0u) || (exponent >= 255u)) { /* no baseline: not positive, tiny, or not finite */
         code = SKN_CODE_OVER_RANGE;
-    } else if ((shift >= 0) && (shift <= 27)) { /* beyond, R/R0 is at least 16 */
+    } else if ((shift >= 0) && (shift <= 27)) { /* for larger shifts, R/R0 is at least 16 */
         code = skn_round_ratio((uint64_t)resistance << (uint32_t)shift, mantissa);
-    } else if ((shift < 0) && (shift >= -11)) { /* beyond, R/R0 is less than 1/8 */
+    } else if ((shift < 0) && (shift >= -11)) { /* for smaller shifts, R/R0 is less than 1/8 */
         code = skn_round_ratio(resistance, mantissa << (uint32_t)(-shift));
     } else {
         code = SKN_CODE_OVER_RANGE;
@@ -227,7 +227,7 @@ SKN_API bool skn_find_wire_faults(const skn_code_t *codes, skn_wire_faults_t *fa
     bool any = false;
 
     (void)memset(faults, 0xFF, sizeof *faults);
-    for (uint32_t row = 0; row < SKN_ROWS; row++) { /* clear the masks where a crossing contradicts */
+    for (uint32_t row = 0; row < SKN_ROWS; row++) { /* clear the bits that a crossing contradicts */
         for (uint32_t column = 0; column < SKN_COLUMNS; column++) {
             const uint32_t code = codes[(row * SKN_COLUMNS) + column];
             const uint32_t upper = UINT32_C(1) << (row % 32u);
@@ -462,7 +462,7 @@ static void skn_store_chunk(skn_assembler_t *a, uint16_t index, const uint8_t *d
     a->stats.chunks_accepted++;
 }
 
-/* Return by how many scans a counter is ahead of the last one, modulo the counter range. */
+/* Return by how many scans a counter is ahead of the last counter, modulo the counter range. */
 static uint16_t skn_ahead(const skn_assembler_t *a, uint8_t counter)
 {
     return (uint16_t)(((uint32_t)counter + a->range - a->counter) % a->range);
@@ -499,7 +499,7 @@ static bool skn_is_news(skn_assembler_t *a, uint8_t counter, int64_t t_us, bool 
 
 static void skn_open(skn_assembler_t *a, uint8_t counter, int64_t t_us, bool from_its_begin)
 {
-    /* Steps to this scan, from 1 to the counter range. Before the first scan, `counter` is that of no scan. */
+    /* Steps to this scan, from 1 to the counter range. Before the first scan, `counter` belongs to no scan. */
     uint32_t steps = skn_ahead(a, counter);
 
     steps = (steps == 0u) ? a->range : steps;
@@ -508,7 +508,7 @@ static void skn_open(skn_assembler_t *a, uint8_t counter, int64_t t_us, bool fro
     a->may_join = false;
     if (!a->number_known) {
         a->number = counter;
-    } else if (!a->counter_known) { /* after a reset, the number goes on from the last one */
+    } else if (!a->counter_known) { /* after a reset, continue from the last number */
         const uint32_t range = a->range;
         const uint32_t after = (((uint32_t)counter + range) - (a->number % range)) % range;
 
@@ -582,7 +582,7 @@ static skn_verdict_t skn_discard(skn_assembler_t *a, skn_verdict_t verdict, bool
     return verdict;
 }
 
-/* Restore the upper bits of a 16-bit device time: the time nearest to the one expected by the master's clock. */
+/* Restore the upper bits of a 16-bit device time: choose the time nearest to that expected from the master's clock. */
 static uint32_t skn_restore_time(skn_assembler_t *a, uint32_t low_us)
 {
     const int64_t elapsed_us = a->summary_us - a->time_at_us;
@@ -598,7 +598,7 @@ static uint32_t skn_restore_time(skn_assembler_t *a, uint32_t low_us)
     return a->time_us;
 }
 
-/* Count the losses of a scan that is published, and write the scan. */
+/* Count the losses of a published scan, and write the scan. */
 static void skn_publish(skn_assembler_t *a, uint16_t expected, skn_scan_t *scan)
 {
     scan->device_time_us = 0;

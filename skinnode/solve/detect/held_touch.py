@@ -1,14 +1,14 @@
-"""A touch from its onset on: decides when it has ended.
+"""Ongoing touch: decides when the touch has ended.
 
-Rest is known less and less well while the patch is touched, because the gains drift. A touch therefore ends
-in one of four ways:
+While the patch is touched, the gains drift, so the readings expected at rest become less and less certain. A
+touch therefore ends in one of four ways:
 
-- the readings agree with rest as it was at the onset;
-- they have changed towards rest, and agree with it within the drift since the onset;
-- a small share of the touch remains and stays constant: the rubber creeps;
-- they have agreed with rest, within the drift, for half an hour.
+- the readings agree with those expected at rest when the touch began;
+- the readings have changed towards rest, and agree with it within the drift since the onset;
+- a small fraction of the touch remains and stays constant, because the rubber creeps;
+- the readings have agreed with rest, within the drift, for half an hour.
 
-A press that is held does none of this for ten minutes, however slight it is.
+A held press meets none of these conditions for ten minutes, however slight it is.
 """
 
 from __future__ import annotations
@@ -21,41 +21,41 @@ from skinnode.solve.detect.touch_kernel import KEPT
 from skinnode.solve.detect.touch_test import TouchTest
 
 RESIDUE: Final = 0.15
-"""Share of a touch's largest amplitude that may remain as creep."""
+"""Fraction of a touch's peak amplitude that may remain as creep."""
 RESIDUE_S: Final = 10.0
-"""Time without a change after which such a remainder is taken for creep, s."""
+"""Time without change after which such a remainder counts as creep, s."""
 FORGOTTEN_S: Final = 1800.0
-"""Time after which a touch that looks no different from drift ends, s."""
+"""Time after which a touch that is indistinguishable from drift ends, s."""
 AVERAGED_S: Final = 1.0
-"""Time over which a touch is averaged, to notice a change, s."""
+"""Averaging time of a touch's readings, with which later readings are compared to detect a change, s."""
 
 
 @dataclass(slots=True)
 class HeldTouch:
-    """A touch that has not ended yet. Energies are ‖z‖² of the mean of four frames."""
+    """Touch that has not ended yet. Its energy is ‖z‖² for the mean of four frames."""
 
     test: TouchTest
-    """Test at the onset."""
+    """Test used at the onset."""
     average: Float
-    """(m,) average change of the readings, without the last frames."""
+    """(m,) average change of the readings, excluding the last frames."""
     period_s: float
     """Scan period, s."""
     creep: float
-    """Energy that may remain of an earlier touch, 0 if there was none."""
+    """Energy that may remain from an earlier touch; 0 if there was none."""
     peak: float = 0.0
-    """Largest energy."""
+    """Largest energy so far."""
     frames: int = 0
     """Number of frames since the onset."""
-    _still: int = 0  # frames since the last change
-    _like_rest: int = 0  # frames in which drift could explain the readings
-    _lighter: bool = True  # whether drift could explain the readings, or they have changed towards rest since
+    _still: int = 0  # number of frames since the last change
+    _like_rest: int = 0  # number of successive frames that drift could explain
+    _lighter: bool = True  # False from a frame that drift cannot explain until a change towards rest
 
     def follow(self, recent: Float, oldest: Float, variance: float, later: TouchTest) -> bool | None:
         """Process a frame; return whether the touch ended, or None if it ended and creep remains.
 
         Args:
-            recent: (4, m) changes of the readings in the last frames.
-            oldest: (m,) the first of them.
+            recent: (4, m) changes of the readings in the last four frames.
+            oldest: (m,) changes of the readings in the first of these frames.
             variance: Noise variance of the stream, relative to the stated variance.
             later: Test that allows for the drift since the onset.
         """
@@ -80,16 +80,16 @@ class HeldTouch:
 
     @property
     def residue(self) -> float:
-        """Energy that may remain as creep, of this touch or of an earlier one."""
+        """Energy that may remain as creep from this touch or an earlier one."""
         return max(RESIDUE**2 * self.peak, self.creep)
 
     @property
     def is_creep(self) -> bool:
-        """Whether the creep of an earlier touch may be all there is."""
+        """Whether creep from an earlier touch may explain the whole touch."""
         return self.creep > RESIDUE**2 * self.peak
 
     def _follow_change(self, now: Float, oldest: Float, variance: float, later: TouchTest) -> None:
-        """Compare the last frames with the average of the touch before them, to notice a change."""
+        """Detect a change by comparing the last frames with the average of the touch before them."""
         share = 1.0 / min(max(1.0, AVERAGED_S / self.period_s), self.frames)
         spread = variance * (1.0 / KEPT + share)
         average = self.average
@@ -103,9 +103,9 @@ class HeldTouch:
 
 
 def creep_of(peak: float, since_s: float) -> float:
-    """Return the energy that may remain of a touch with the energy ``peak``, ``since_s`` after its end.
+    """Return the energy that may remain ``since_s`` after the end of a touch with the peak energy ``peak``.
 
-    Creep slows down: in the first :data:`RESIDUE_S`, :data:`RESIDUE` of the amplitude may remain, afterwards
-    less in inverse proportion to the time.
+    Creep slows down. During the first :data:`RESIDUE_S`, a fraction :data:`RESIDUE` of the amplitude may
+    remain; afterwards, this fraction decreases in inverse proportion to time.
     """
     return peak * (RESIDUE * min(1.0, RESIDUE_S / max(since_s, 1e-9))) ** 2

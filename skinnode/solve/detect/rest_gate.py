@@ -2,8 +2,8 @@
 
 The field of an untouched patch is zero. Its standard deviations, statuses and trust are those of the last
 solved frame that was untouched, converged and trusted, with the same usable readings and the same noise. The
-gate opens for every frame that is touched, doubtful, or contains an unusual reading or wire, so that the data
-check examines it. The gate stays open while readings are left out because of a fault.
+gate opens for every frame that is touched or doubtful, or contains an unusual reading or wire, so that the
+data check examines it. The gate stays open while readings are left out because of a fault.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISIER: Final = 1.25
-"""Ratio of a frame's noise to that of the detector above which the detector is adapted to the frame."""
+"""Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
 SAME: Final = 0.1
-"""Relative difference in noise up to which a rest field stays valid."""
+"""Maximum relative change in noise for which a rest field stays valid."""
 
 
 class RestGate:
-    """Detector of one patch, and its field at rest. Each stream needs its own instance.
+    """Touch detector of one patch, and the patch's field at rest. Each stream needs its own instance.
 
     Args:
         layout: The patch.
@@ -79,7 +79,7 @@ class RestGate:
         noise: Float | None,
         left_out: NDArray[np.bool_] | None,
     ) -> FieldFrame | None:
-        """Return the field of a frame that need not be solved; None if it must be solved.
+        """Return the field of a frame if it need not be solved; None if it must be solved.
 
         Args:
             ohm: (U, K) resistances, ohm.
@@ -135,14 +135,14 @@ class RestGate:
         return amended(field, touched=verdict.touched, touch_odds=verdict.odds)
 
     def set_noise_factor(self, factor: float) -> None:
-        """Set the factor of the stated noise; the next untouched frame is solved again."""
+        """Set the factor that multiplies the stated noise; the next untouched frame is then solved again."""
         if factor != self._factor:
             self._factor = factor
             self.detector.set_noise(factor)
             self._field = None
 
     def _fits(self, noise: Float | None) -> bool:
-        """Return whether the rest field has the usable readings and the noise of the last frame."""
+        """Return whether the last frame has the same usable readings and noise as the rest field."""
         before = self._noise_of_field
         if (noise is None) != (before is None):
             return False
@@ -156,7 +156,7 @@ class RestGate:
         return self._used is not None and np.array_equal(self._used, self.detector.used)
 
     def _adapt(self, noise: Float) -> None:
-        """Adapt the detector if the frame's noise differs from that of the last frames."""
+        """Adapt the detector if the frame's noise differs from the noise that the detector assumes."""
         usable = noise[(noise > 0.0) & (noise < math.inf)]
         if not usable.size:
             return

@@ -1,12 +1,13 @@
-"""Slow state of an untouched patch: gains of its wires, offsets of its readings, and its own drift.
+"""Slow state of an untouched patch: the wires' gains, the readings' offsets, and the measured drift.
 
-The state is estimated from blocks of untouched frames. A block waits until the next one is complete before it
-is used, so that the frames just before a touch is noticed do not enter the estimate. Each reading also has an
-offset, which follows errors of R₀, rounding and creep over minutes.
+The state is estimated from blocks of untouched frames. A block is used only after the next block is
+complete, so that the frames just before the detection of a touch do not enter the estimate. Each reading also
+has an offset, which follows errors in R₀, rounding and creep over minutes.
 
-The prior of the drift is a random walk of :data:`skinnode.solve.detect.gain_drift.DRIFT` in an hour. The
-stream then shows its own drift: the means of its wires over two blocks some seconds apart. The less a stream
-drifts, the more slowly its gains follow, and the slower a press may be and still be found.
+The prior of the drift is a random walk with a standard deviation of
+:data:`skinnode.solve.detect.gain_drift.DRIFT` after one hour. The drift of the stream is then measured by
+comparing the wires' means over two blocks some seconds apart. The less a stream drifts, the more slowly its
+gains follow the readings, and the slower the presses that can still be detected.
 """
 
 from __future__ import annotations
@@ -26,30 +27,30 @@ BLOCK_S: Final = 0.25
 BLOCK: Final = 4
 """Minimum number of frames in a block."""
 HELD_BACK: Final = 2.0
-"""Age of the newest frame in the estimate at most, in blocks, while the patch is untouched."""
+"""Maximum age of the newest frame in the estimate while the patch is untouched, blocks."""
 COARSER: Final = 4.0
-"""Ratio of the ages for which tests are made."""
+"""Ratio of successive ages for which tests are computed."""
 MOST_LEVEL: Final = 12
-"""Number of the greatest age for which a test is made; months."""
+"""Maximum level of a test, for gains that are several months old."""
 FINER: Final = math.sqrt(2.0)
-"""Ratio of the drifts for which tests are made."""
+"""Ratio of successive drifts for which tests are computed."""
 PRIOR: Final = 8.0
-"""Number of independent measurements of the drift after which the stated drift no longer counts."""
+"""Number of independent drift measurements after which the stated drift no longer counts."""
 WITHIN_S: Final = 120.0
-"""Time over which the drift of a stream is averaged, s."""
+"""Averaging time of a stream's drift, s."""
 MOST_DRIFT: Final = 2.0
-"""Largest drift, relative to the stated one."""
+"""Maximum drift, relative to the stated drift."""
 OFFSET_S: Final = 600.0
-"""Time over which the offsets of the readings are averaged, s."""
+"""Averaging time of the readings' offsets, s."""
 OFFSET_FRAMES: Final = 100
-"""Weight of the offset zero, in frames."""
+"""Weight of an offset of zero in the average, in frames."""
 CREEP: Final = 6.0
-"""Offsets are averaged over the time since the release divided by this number, if that is less than
-:data:`OFFSET_S`: rubber creeps back ever more slowly."""
+"""Ratio of the time since the last release to the averaging time of the offsets, which is at most
+:data:`OFFSET_S`. The averaging time increases because rubber creeps back more and more slowly."""
 START_S: Final = 60.0
-"""Time since the measurement of the baseline that the first frames assume, s."""
+"""Assumed time from the measurement of the baseline to the first frame, s."""
 CONVERGED: Final = 1.1
-"""Ratio to the steady state of the readings' variance, below which the gains have settled."""
+"""Ratio of the readings' variance to its steady-state value, below which the gains have settled."""
 
 
 class SlowState:
@@ -57,13 +58,13 @@ class SlowState:
 
     Args:
         patch: Patch and noise.
-        start: Prior variances (U + K + 1,) of the gains at the start, as squares of relative errors; the
-            drift over :data:`START_S` if None.
+        start: Initial variances (U + K + 1,) of the gains, as squares of relative errors; None to assume the
+            drift over :data:`START_S`.
 
     Attributes:
-        expected: (U, K) changes of the readings of an untouched patch, in units of their noise.
+        expected: (U, K) expected changes of an untouched patch's readings, in units of their noise.
         age: Number of frames since the newest frame in the estimate.
-        offset_share: Variance of the offsets' errors, relative to the noise variance.
+        offset_share: Error variance of the offsets, relative to the noise variance.
     """
 
     def __init__(self, patch: PatchNoise, start: Float | None = None) -> None:
@@ -76,7 +77,7 @@ class SlowState:
         self._sum, self._seen = np.zeros((upper, lower)), np.zeros((upper, lower))
         unit = float(np.median(patch.noise))
         self._unit = unit
-        self._floor = unit * math.sqrt(3600.0) / 64.0  # less drift does not matter
+        self._floor = unit * math.sqrt(3600.0) / 64.0  # a smaller drift does not matter
         self.reset()
 
     def reset(self) -> None:
@@ -86,10 +87,10 @@ class SlowState:
         self.expected[:] = 0.0
         self._filled, self._waiting = 0, False
         self._waiting_mean = np.zeros((upper, lower))
-        self._measured, self._weight = 0.0, 0.0  # of the drift: sum of q, number of blocks
+        self._measured, self._weight = 0.0, 0.0  # drift: mean of the measurements, and their number
         self._patch_measured = 0.0
         self._means: list[tuple[Float, Float]] = []
-        self._frames = 0  # in the offsets
+        self._frames = 0  # number of frames in the offsets
         self._released: int | None = None  # number of frames since the last release
         self._set_drift(DRIFT, PATCH_DRIFT)
         self.age = 0
@@ -109,7 +110,7 @@ class SlowState:
         )[0]
 
     def _level_for(self, covariance: Float) -> int:
-        """Return the number of the least age whose test covers the given covariance of the gains."""
+        """Return the lowest level whose test covers the given covariance of the gains."""
         variance = float(np.einsum("ij,ji->", covariance, self._visible)) - self._steady_variance
         level, seconds, diagonal = 0, self._base * self._patch.period_s, self._visible.diagonal()
         while level < MOST_LEVEL and (self._filter.growth(seconds) * diagonal).sum() < 0.999 * variance:
@@ -118,34 +119,34 @@ class SlowState:
 
     @property
     def test(self) -> TouchTest:
-        """Test that accounts for the present error of the gains."""
+        """Test for the current uncertainty of the gains."""
         return self.test_at(self._level)
 
     def test_at(self, level: int) -> TouchTest:
-        """Return the test for a level: gains as old as :data:`HELD_BACK` blocks times a power of four."""
+        """Return the test for gains that are :data:`HELD_BACK` · 4^``level`` blocks old."""
         seconds = self._base * self._patch.period_s * COARSER**level
         return touch_test(self._patch, self._drift, self._patch_drift, seconds)
 
     @property
     def level(self) -> int:
-        """Number of the present test."""
+        """Level of the current test."""
         return self._level
 
     @property
     def drift(self) -> float:
-        """Standard deviation of the change of a wire's gain in an hour, as assumed at present."""
+        """Currently assumed standard deviation of the change in a wire's gain in one hour."""
         return self._drift
 
     @property
     def gains(self) -> Float:
-        """(U + K + 1,) relative changes of conductance, of the upper and lower wires and of the patch."""
+        """(U + K + 1,) relative changes in conductance of the upper wires, the lower wires and the patch."""
         return self._gains * self._unit
 
     def collect(self, y: Float, present: NDArray[np.bool_] | None, noise: float) -> bool:
         """Add an untouched frame; return whether :attr:`expected` or :attr:`test` changed.
 
         Args:
-            y: (U, K) changes of the readings, in units of their noise, beyond those expected.
+            y: (U, K) unexpected changes of the readings, in units of their noise.
             present: (U, K) mask of the readings; None if all are present.
             noise: Noise variance of the stream, relative to the stated variance.
         """
@@ -164,7 +165,7 @@ class SlowState:
         return True
 
     def skip(self) -> bool:
-        """Pass a frame without using it; return whether :attr:`test` changed."""
+        """Count a frame without using it; return whether :attr:`test` changed."""
         self._pass_frame()
         return self._grow()
 
@@ -174,7 +175,7 @@ class SlowState:
             self._released += 1
 
     def _grow(self) -> bool:
-        """Account for the age of the gains; return whether the level changed."""
+        """Adapt the level to the age of the gains; return whether the level changed."""
         if self.age <= self._base and self._covariance is None:
             return False
         covariance = self._filter.steady if self._covariance is None else self._covariance
@@ -186,16 +187,16 @@ class SlowState:
         return self._level != before
 
     def discard(self) -> None:
-        """Discard the frames that wait to be used, because a touch was found."""
+        """Discard the frames that have not been used yet, because a touch was detected."""
         self._sum[:], self._seen[:], self._filled, self._waiting = 0.0, 0.0, 0, False
         self._means.clear()
 
     def released(self, residue: Float | None = None) -> None:
-        """Note the end of a touch.
+        """Record the end of a touch.
 
         Args:
-            residue: (U, K) changes beyond those expected that remain after the touch, which become offsets;
-                None if there are none.
+            residue: (U, K) unexpected changes that remain after the touch and become offsets; None if there
+                are none.
         """
         self._released = 0
         if residue is not None:
@@ -204,10 +205,10 @@ class SlowState:
             self._covariance, self.age, self._level = None, 0, 0
 
     def carry_on(self, gains: Float, expected: Float) -> None:
-        """Continue with the gains and the expectation of the same stream at another noise.
+        """Continue with the gains and expected changes of the same stream at a different noise.
 
         Args:
-            gains: (U + K + 1,) relative changes of conductance; see :attr:`gains`.
+            gains: (U + K + 1,) relative changes in conductance; see :attr:`gains`.
             expected: (U, K) expected changes, in units of the noise.
         """
         self._gains = gains / self._unit
@@ -220,7 +221,7 @@ class SlowState:
         period_s = self._patch.period_s
         self._measure_drift(mean, noise)
         beyond = mean - self.expected
-        since = self.age - 2 * self._patch.block  # from the last block used to this one
+        since = self.age - 2 * self._patch.block  # frames since the last block that was used
         if self._covariance is None and since * period_s <= 2.5 * self._block_s:
             gain = self._steady_gain
         else:
@@ -284,12 +285,12 @@ class SlowState:
             self._set_drift(drift, patch_drift)
 
     def _chosen(self, used: float, stated: float, measured: float, std: float) -> float:
-        """Return the drift (standard deviation in an hour) to assume.
+        """Return the drift (standard deviation in one hour) to assume.
 
         Args:
-            used: Drift assumed so far.
+            used: Currently assumed drift.
             stated: Drift of the prior.
-            measured: Mean measured drift, as a growth of variance in a second in units of the noise.
+            measured: Mean measured drift: growth of variance per second, relative to the noise variance.
             std: Standard deviation of a single measurement.
         """
         independent = self._weight / self._blocks_apart

@@ -1,4 +1,4 @@
-"""Touch detector of one patch: decides before anything is solved whether the skin is touched.
+"""Touch detector of one patch: decides, before anything is solved, whether the patch is touched.
 
 A touch begins when the statistic of a frame, or of the mean of three frames, exceeds its threshold
 (:mod:`skinnode.solve.detect.touch_test`). :mod:`skinnode.solve.detect.held_touch` decides when it has ended.
@@ -37,27 +37,27 @@ from skinnode.solve.detect.touch_test import (
 )
 
 ENOUGH: Final = 0.5
-"""Minimum share of usable readings; with fewer, the detector does not decide."""
+"""Minimum fraction of usable readings. With fewer, the detector makes no decision."""
 ODD_READING: Final = 6.0
-"""Change of a single reading, in standard deviations, above which a frame is solved and its data checked.
-Noise exceeds it in one of 1,700,000 frames of 300 readings."""
+"""Change of a single reading, in standard deviations, above which a frame is solved and its data are checked.
+Noise exceeds this limit in one of 1,700,000 frames of 300 readings."""
 ODD_WIRE: Final = 8.0
-"""Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data checked.
-Noise exceeds it in one of 25,000 frames or fewer."""
+"""Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data are
+checked. Noise exceeds this limit in at most one of 25,000 frames."""
 TOUCHES_PER_S: Final = 1.0 / 60.0
 """Prior rate of touches, 1/s, for the odds."""
 TOUCH_S: Final = 1.0
 """Prior mean duration of a touch, s, for the odds."""
 PREPARED: Final = 6
-"""Number of tests made in advance, for touches of up to ten minutes."""
+"""Number of tests computed in advance; enough for touches of up to ten minutes."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30
 """Weight of the stated noise, in frames."""
 QUIETER: Final = 0.6
-"""Ratio of a touched frame's noise variance to the average, below which the average must be too large."""
+"""Ratio of a touched frame's noise variance to the average, below which the average counts as too large."""
 NOISE_STEP: Final = 1.25
-"""Largest ratio of a frame's noise variance to the average that enters the average."""
+"""Maximum factor between the average and a frame's noise variance; variances beyond it are clipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +77,12 @@ class TouchDetector:
 
     Args:
         layout: The patch.
-        baseline_ohm: (U, K) resistances at rest, ohm; readings without a positive one are ignored.
-        noise: (U, K) relative standard deviation of the readings, without quantization.
+        baseline_ohm: (U, K) resistances at rest, ohm. Crossings without a positive, finite value are ignored.
+        noise: (U, K) relative standard deviation of the readings, excluding quantization.
         rounding: (U, K) relative standard deviation of the quantization error.
         period_s: Scan period, s.
         false_alarms_per_hour: Accepted number of false alarms in an hour.
-        gain_std: (U + K + 1,) standard deviation of the gains at the start; None for a fresh baseline.
+        gain_std: (U + K + 1,) initial standard deviations of the gains; None for a fresh baseline.
 
     Attributes:
         touched: Whether the patch is touched, as of the last frame with enough readings.
@@ -125,7 +125,7 @@ class TouchDetector:
         self.reset()
 
     def _prepare(self) -> None:
-        """Make the slow state and the test for the present noise."""
+        """Create the slow state and the test for the current noise."""
         sigma = np.hypot(self._factor * self._own, self._rounding)
         # noise of half a code or more makes the quantization errors of successive frames independent
         coded = self._rounding**2 / sigma**2
@@ -147,7 +147,7 @@ class TouchDetector:
         self._use_test()
 
     def prepare(self) -> None:
-        """Make the tests that a stream needs in its first minutes; each takes about 15 ms."""
+        """Compute the tests that a stream needs in its first minutes. Each test takes about 15 ms."""
         for level in range(PREPARED):
             self._slow.test_at(level)
 
@@ -155,23 +155,23 @@ class TouchDetector:
         self._test: TouchTest = self._slow.test
 
     def reset(self) -> None:
-        """Forget the stream; the patch counts as untouched and the baseline as fresh."""
+        """Forget the stream; regard the patch as untouched and the baseline as fresh."""
         self.touched = False
         self._noise, self._noise_frames = 1.0, NOISE_START
         self._at, self._frames = 0, 0
         self._log_odds = -math.inf
         self._clock = 0  # frames
-        self._crept_peak, self._crept_at = 0.0, 0  # of the last touch that was not itself creep
+        self._crept_peak, self._crept_at = 0.0, 0  # last touch that was not itself creep
         self._slow.reset()
         self._use_test()
         self._arrays.expected[:] = 0.0
 
     def set_noise(self, factor: float, noise: Float | None = None) -> None:
-        """Change the noise; the state of the stream is kept.
+        """Change the noise, and keep the state of the stream.
 
         Args:
-            factor: Factor by which the stated noise without quantization is multiplied.
-            noise: (U, K) stated noise; as before if None.
+            factor: Factor that multiplies the stated noise, excluding quantization.
+            noise: (U, K) stated noise; None to keep the current one.
         """
         if factor == self._factor and noise is None:
             return
@@ -188,17 +188,17 @@ class TouchDetector:
 
     @property
     def test(self) -> TouchTest:
-        """Test in use."""
+        """Current test."""
         return self._test
 
     @property
     def gains(self) -> Float:
-        """(U + K + 1,) relative errors of the readings of the upper and lower wires and of the patch."""
+        """(U + K + 1,) relative errors in resistance of the upper wires, the lower wires and the patch."""
         return -self._slow.gains
 
     @property
     def residual(self) -> Float:
-        """(U,) RMS relative change since rest of the readings of each upper wire in the last frame."""
+        """(U,) RMS relative change from rest of each upper wire's readings in the last frame."""
         return self._arrays.residual.copy()
 
     @property
@@ -223,8 +223,8 @@ class TouchDetector:
 
         Args:
             ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False for readings to be ignored; None if there are none.
-            noise: (U, K) relative noise of this frame with quantization, if it may be larger than usual.
+            valid: (U, K) bool, False for readings to be ignored; None to use all readings.
+            noise: (U, K) relative noise of this frame, including quantization; None for the usual noise.
         """
         its = self._arrays
         its.ohm[:] = ohm
@@ -259,7 +259,7 @@ class TouchDetector:
         see_frame(self._arrays.table, test.rows, test.shares, test.log_dets, variance, self._at, self._frames)
 
     def _follow_noise(self, found: list[float]) -> None:
-        """Average the noise variance. In touched frames, motion adds to it."""
+        """Average the noise variance. In touched frames, motion increases the measured variance."""
         now = found[MOTION]
         unsure = self._noise_frames < 2 * NOISE_START or now < QUIETER * self._noise
         if now < 0.0 or (self.touched and not unsure):
@@ -287,7 +287,7 @@ class TouchDetector:
         return not (doubt or odd)
 
     def _change_test(self) -> None:
-        """Use the slow state's present expectation and test."""
+        """Use the slow state's current expected changes and test."""
         its, slow = self._arrays, self._slow
         its.recent += (its.expected - slow.expected).ravel()
         its.expected[:] = slow.expected
@@ -295,7 +295,7 @@ class TouchDetector:
         retest(its.table, self._test.rows, self._at, self._frames)
 
     def _update_odds(self, log_ratio: float) -> None:
-        """Update the odds with a frame's log likelihood ratio, by Bayes' rule in a chain of two states."""
+        """Update the odds with a frame's log likelihood ratio: Bayes' rule for a two-state Markov chain."""
         begins = min(TOUCHES_PER_S * self._period_s, 0.5)
         ends = min(self._period_s / TOUCH_S, 0.5)
         odds = bounded_exp(self._log_odds)

@@ -15,37 +15,37 @@ from skinnode.solve.linalg.cholesky import multiply_vector
 KEPT: Final = 4
 """Number of frames kept for the means."""
 STATISTICS: Final = (1, 3, 4)
-"""Numbers of frames of the means whose statistic is computed."""
+"""Numbers of frames in the means for which the statistic is computed."""
 WORST, UPPER, LOWER, COUNT, MOTION, RATIO = 3, 4, 5, 6, 7, 8
 """Positions of the other results in ``found``."""
 
 
 class TouchArrays(ArrayTable):
-    """Arrays of the detector of one patch. Changes y are in units of the noise of their reading."""
+    """Arrays of one patch's detector. Changes y are in units of the reading's noise."""
 
     ohm: Annotated[NDArray[np.float64], "U K"]
     """Resistances of the frame, ohm; NaN where missing."""
     rest: Annotated[NDArray[np.float64], "U K"]
     """Resistances at rest, ohm."""
     weight: Annotated[NDArray[np.float64], "U K"]
-    """1 / σ of each reading, or less if the frame is noisier than usual; 0 where it is to be ignored."""
+    """1 / σ of each reading, or less if the frame is noisier than usual; 0 for readings to be ignored."""
     expected: Annotated[NDArray[np.float64], "U K"]
-    """Changes y of an untouched patch, from the gains and the offsets of its readings."""
+    """Changes y expected without a touch, computed from the gains and offsets."""
     recent: Annotated[NDArray[np.float64], "4 m"]
     """Unexpected changes of the last frames."""
     products: Annotated[NDArray[np.float64], "4 R"]
     """z = G y of the last frames; only the first columns are used if the test has fewer rows."""
     residual: Annotated[NDArray[np.float64], "U"]
-    """RMS of ln(R₀/R) of each upper wire's readings; inf without any."""
+    """RMS of ln(R₀/R) over each upper wire's readings; inf if the wire has no readings."""
     columns: Annotated[NDArray[np.float64], "K"]
     """Work array."""
     counts: Annotated[NDArray[np.float64], "K"]
     """Work array."""
     found: Annotated[NDArray[np.float64], "9"]
-    """Results: w ‖mean z‖² for w of 1, 3 and 4 frames; largest |y| of a reading and largest excess of χ² of
-    an upper and of a lower wire, each in standard deviations; number of readings used; noise variance from
-    three successive frames, in units of the stated variance, or −1; log likelihood ratio of touch to no
-    touch."""
+    """Results: w ‖mean z‖² for w = 1, 3 and 4 frames; largest |y| of a reading, and largest χ² excess of an
+    upper wire and of a lower wire, each in standard deviations; number of readings used; noise variance from
+    three successive frames, relative to the stated variance, or −1 if unknown; log likelihood ratio of touch
+    to no touch."""
 
 
 arrays_of = reader(TouchArrays)
@@ -160,7 +160,7 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def retest(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> None:
-    """Compute the statistics of the last frames again with another test; see :func:`see_frame`."""
+    """Recompute the statistics of the last frames with another test; see :func:`see_frame`."""
     its = arrays_of(table)
     size = rows.shape[0]
     for back in range(frames):

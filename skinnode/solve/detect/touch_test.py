@@ -1,9 +1,9 @@
-"""Test of a frame for touch: a quadratic form of its readings, and thresholds from its own distribution.
+"""Touch test of a frame: a quadratic form of the readings, with thresholds from its own distribution.
 
-Let y = ln(R₀/R)/σ be the changes of the readings since rest, in units of their noise, after subtraction of
-the estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ covers the noise and the error of
-the gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
-response of the readings to loads at a depth that noise almost hides. A touched frame therefore has
+Let y = ln(R₀/R)/σ be the changes of the readings from rest, in units of their noise, after subtraction of
+the estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ includes the noise and the errors
+of the gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
+readings' response to loads at a depth that noise almost hides. A touched frame therefore has
 y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
     T = yᵀ (V₀⁻¹ − (V₀ + B Bᵀ)⁻¹) y
@@ -12,12 +12,12 @@ With the eigenvectors u_i and eigenvalues μ_i of Bᵀ V₀⁻¹ B, T is the sum
 of G are g_i = (1 + μ_i)^−½ V₀⁻¹ B u_i. Without a touch, the z_i are independent with the variances d_i =
 μ_i / (1 + μ_i), so T has the distribution of :mod:`skinnode.solve.detect.weighted_chi_squared`.
 
-The odds of a touch allow for every depth c times as large, which replaces μ_i with c² μ_i. The log
-likelihood ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)), and all octaves of c are
-equally likely.
+The odds of touch allow for depths c times as large, for which c² μ_i replaces μ_i. The log likelihood ratio
+is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)). All octaves of c are equally likely.
 
-The mean of w successive frames reveals a touch w times as clearly as one frame, because noise is independent
-from frame to frame. The error of the gains is not, so the mean has its own distribution and threshold.
+In the mean of w successive frames, the squared signal-to-noise ratio of a touch is w times that of one frame,
+because noise is independent from frame to frame. The errors of the gains are not independent, so the mean has
+its own distribution and threshold.
 """
 
 from __future__ import annotations
@@ -36,35 +36,35 @@ from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 from skinnode.solve.posterior.load_cells import LoadCells
 
 DEPTH: Final = 5.0
-"""RMS normal displacement of the loads in the alternative, in layer heights times the relative noise: 0.5 %
-of the layer height at a noise of 1e-3. There, depths of 0.25 % to 1 % detect almost equally well; depths of
-2 % and more find fewer presses of 2 %."""
+"""RMS normal displacement in the alternative hypothesis, in layer heights times the relative noise. At a
+noise of 1e-3, this is 0.5 % of the layer height. Tests for 0.25 % to 1 % detect touches almost equally well;
+tests for 2 % and more detect fewer presses of 2 %."""
 DEEPEST: Final = 0.16
-"""Largest RMS normal displacement that the odds allow for, in layer heights."""
+"""Maximum RMS normal displacement in the odds, layer heights."""
 SHALLOWEST: Final = 0.5
-"""Smallest one, relative to that of the alternative."""
+"""Minimum RMS normal displacement in the odds, relative to that in the alternative hypothesis."""
 LEAST_WEIGHT: Final = 0.02
 """Minimum weight κ² λ of an eigenvector of the elastic prior in the test."""
 MOST_VECTORS: Final = 96
-"""Maximum number of eigenvectors of the elastic prior in the test; their cost grows in proportion."""
+"""Maximum number of eigenvectors of the elastic prior in the test. The cost is proportional to it."""
 WINDOWS: Final = (1, 3)
-"""Numbers of frames whose mean is tested for the onset of a touch."""
+"""Numbers of frames in the means that are tested for the onset of a touch."""
 RELEASE_FRAMES: Final = 4
-"""Number of frames whose mean is tested for the release of a touch."""
+"""Number of frames in the mean that is tested for the release of a touch."""
 RELEASE_CHANCE: Final = 0.01
-"""Probability that noise alone delays the release of a touch by a frame."""
+"""Probability that noise alone delays the release of a touch by one frame."""
 CHANGE_CHANCE: Final = 1e-6
-"""Probability that noise alone looks like a change of a held touch in a frame."""
+"""Probability per frame that noise alone looks like a change in a held touch."""
 DOUBT_CHANCE: Final = 0.003
 """Probability that noise alone opens the gate for a frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class TouchTest:
-    """Test of a frame, for one patch, one noise and one error of the gains."""
+    """Touch test for one patch, one noise and one covariance of the gains."""
 
     rows: Float
-    """(r, m) G, by which the changes of the readings are multiplied."""
+    """(r, m) matrix G, which multiplies the changes of the readings."""
     weights: Float
     """(r,) variances d of z = G y without a touch."""
     shares: Float
@@ -74,25 +74,25 @@ class TouchTest:
     onset: tuple[float, ...]
     """Thresholds of w ‖mean z‖² for the windows w in :data:`WINDOWS`."""
     doubt: tuple[float, ...]
-    """Values of w ‖mean z‖² above which a frame is solved, although no touch is reported."""
+    """Thresholds of w ‖mean z‖² above which a frame is solved even if no touch is reported."""
     change: float
-    """Threshold of ‖z‖², relative to its usual variance, above which a touch has changed."""
+    """Threshold of ‖z‖², relative to its noise variance, above which a touch has changed."""
     release: float
     """Threshold of w ‖mean z‖² for w = :data:`RELEASE_FRAMES`, below which a touch ends."""
     covariance: Float
-    """(U + K + 1, U + K + 1) covariance of the gains, for which the test was made."""
+    """(U + K + 1, U + K + 1) covariance of the gains for which the test was computed."""
 
 
 @dataclass(frozen=True)
 class PatchNoise:
-    """What the tests of a patch depend on, apart from the error of the gains."""
+    """All inputs of a patch's tests, except the errors of the gains."""
 
     layout: PatchLayout
     sigma: bytes
     """(U, K) relative noise of the readings, as float64."""
     coded: float
-    """Share of the noise variance that is the same in successive frames: the quantization error of a noise
-    below half a code."""
+    """Fraction of the noise variance that is the same in successive frames: the quantization error, if the
+    noise is below half a code."""
     period_s: float
     """Scan period, s."""
     false_alarms_per_hour: float
@@ -108,9 +108,9 @@ class PatchNoise:
 
 @functools.lru_cache(maxsize=128)
 def filter_of(key: PatchNoise, drift: float, patch_drift: float) -> GainFilter:
-    """Return the gain filter for a drift of the wires and of the patch, from a cache if possible.
+    """Return the gain filter for the drifts of the wires and the patch, from a cache if possible.
 
-    Both drifts are standard deviations of the change in an hour.
+    Both drifts are standard deviations of the change in one hour.
     """
     return gain_filter(key.noise, drift, patch_drift, key.block, key.block * key.period_s)
 
@@ -119,12 +119,12 @@ def filter_of(key: PatchNoise, drift: float, patch_drift: float) -> GainFilter:
 def touch_test(key: PatchNoise, drift: float, patch_drift: float, seconds: float) -> TouchTest:
     """Return the test for gains that were last estimated ``seconds`` ago, from a cache if possible.
 
-    A new test takes about 10 ms for the reference patch.
+    Computing a new test for the reference patch takes about 10 ms.
 
     Args:
         key: Patch, noise and accepted false alarms.
-        drift: Standard deviation of the change of a wire's gain in an hour.
-        patch_drift: Standard deviation of the change of the patch's gain in an hour.
+        drift: Standard deviation of the change in a wire's gain in one hour.
+        patch_drift: Standard deviation of the change in the patch's gain in one hour.
         seconds: Time since the newest frame used to estimate the gains, s.
     """
     gains, sigma = filter_of(key, drift, patch_drift), key.noise.ravel()
@@ -180,19 +180,19 @@ def _vectors(layout: PatchLayout) -> tuple[Float, Float]:
 def _responses(layout: PatchLayout) -> Float:
     """Return B (m, r) for readings with equal noise."""
     vectors, values = _vectors(layout)
-    kappa = DEPTH * LoadCells.of(layout).height_m / layout.pitch_m  # depth in pitches over the noise
+    kappa = DEPTH * LoadCells.of(layout).height_m / layout.pitch_m  # depth divided by the noise, pitches
     share = kappa * np.sqrt(values)
     kept = share**2 > min(LEAST_WEIGHT, 0.5 * float(share.max()) ** 2)
     return np.asarray(vectors[:, kept] * share[kept])
 
 
 def log_likelihood_ratio(test: TouchTest, z: Float) -> float:
-    """Return the log likelihood ratio of touch to no touch of a frame with z = G y (r,)."""
+    """Return the log likelihood ratio of touch to no touch for a frame with z = G y (r,)."""
     terms = 0.5 * (test.shares @ (z * z) - test.log_dets)
     most = float(terms.max())
     return most + math.log(float(np.exp(terms - most).sum()))
 
 
 def bounded_exp(value: float) -> float:
-    """Return exp(value), or inf where it overflows."""
+    """Return exp(value), or inf on overflow."""
     return math.exp(value) if value < 700.0 else math.inf

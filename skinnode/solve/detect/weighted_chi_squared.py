@@ -1,4 +1,4 @@
-"""Tail of a weighted sum of χ² variables, the distribution of the touch statistic without a touch.
+"""Tail of a weighted sum of χ² variables, the distribution of the touch statistic on an untouched patch.
 
 The tail of T = Σ w_i z_i² for independent standard normal z_i follows from the cumulant generating function
 K(t) = −½ Σ ln(1 − 2 t w_i) by the saddle-point approximation of Lugannani and Rice (Advances in Applied
@@ -16,7 +16,7 @@ import numpy as np
 from skinnode.model.layout import Float
 
 _STEPS: Final = 200
-"""Maximum number of steps of each iteration; they take 5 to 60."""
+"""Maximum number of steps in each search; 5 to 60 are typical."""
 _TOLERANCE: Final = 1e-6
 """Relative error of the probability at which the search for a quantile ends."""
 
@@ -77,7 +77,7 @@ def upper_quantile(weights: Float, probability: float) -> float:
 
 
 def _saddle_point(weights: Float, value: float) -> float:
-    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, by Newton's method between two bounds."""
+    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, by Newton's method within two bounds."""
     high = 0.5 / float(weights.max())
     low = -0.5 * weights.size / value  # there, K' < value
     t = 0.0

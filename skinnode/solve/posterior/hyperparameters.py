@@ -39,8 +39,8 @@ ADAPTIONS: Final = 5
 DISC_FITS: Final = 2
 """Maximum number of fits of the discs per frame."""
 REFIT: Final = 0.1
-"""Largest change in a coordinate since the last fit of the discs, relative to the largest displacement, above
-which the discs are fitted again."""
+"""Change in any coordinate since the last fit of the discs, relative to the largest displacement, above
+which the discs are refitted."""
 UNTOUCHED: Final = 0.1
 """Load variance expected on untouched skin, relative to the minimum prior variance of equal loads over the
 whole patch (:data:`SCALE_LEAST`)."""
@@ -49,8 +49,8 @@ FAR_LOADS: Final = 0.05
 contact, the skin does not move exactly like a half-space. With 0, the 95 % intervals contained 90 % of the
 errors under ridges on a bonded layer; with 0.03, they contained 97 %."""
 NOISY: Final = 2.0
-"""Additional change since the last fit of the discs, in standard deviations of the least certain coordinate,
-above which the discs are fitted again."""
+"""Noise allowance added to the limit :data:`REFIT`, in standard deviations of the least certain
+coordinate."""
 REFINEMENTS: Final = 3
 """Maximum number of updates of the expected load locations per frame. Each update costs as much as two
 solves."""
@@ -111,9 +111,9 @@ class Hyperparameters:
             self.discs.reset()
 
     def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
-        """Return standard deviations (U, f) that include the uncertainty of the discs, pitches.
+        """Return both standard deviations (U, f) in pitches, including the uncertainty of the discs.
 
-        The first also allows for a further touch that is too light to be found.
+        The first result also allows for a further touch that is too light to be detected.
         """
         if self.discs is None:
             return std, core
@@ -201,10 +201,10 @@ class Hyperparameters:
         return self._set_scale(local=local, refine=refinements > 0)
 
     def _fit_discs(self, observation: Observation, members: Index, uniform: bool) -> bool:
-        """Fit the discs to the frame, unless they fit already; return whether the prior changed.
+        """Fit the discs to the frame, unless they already fit; return whether the prior changed.
 
-        The first discs of a touch are fitted with data linearised at a field that the uniform prior has
-        blurred, so they are fitted again to their own field.
+        The first discs of a touch are fitted to data linearised at a field that the uniform prior has
+        blurred. They are therefore refitted to data linearised at the field that they lead to.
         """
         discs, prior, estimator = self.discs, self._prior, self._estimator
         assert discs is not None

@@ -3,8 +3,8 @@
 The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
 the prior expects loads mainly at the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
 where they were found (:meth:`LoadPrior.localise`). The skin next to a contact is then estimated to move only
-as far as the loads of the contact require. In tests, expecting loads where they were found reduced
-displacement errors by a factor of two to three.
+as far as the contact's loads require. In tests, expecting loads where they were found reduced displacement
+errors by a factor of two to three.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ SMOOTH_SHARE: Final = 0.25
 less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
 displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 DISC_SLACK: Final = 0.07
-"""Standard deviation of the displacement that discs cause but no load explains, independently at each
-electrode, relative to the displacement expected there. With 0, an error exceeded five standard deviations in
-one of ten dents; with 0.1, in none of 30."""
+"""Standard deviation of the displacement that loads in discs do not explain, independent at each electrode,
+relative to the displacement expected there. With 0, an error exceeded five standard deviations in one of ten
+dents; with 0.1, in none of 30."""
 DISC_DOUBT: Final = 2.5
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
 DISC_SHARE: Final = 0.8
@@ -126,7 +126,7 @@ class LoadPrior:
         self._loads: tuple[Float, Float] | None = None  # last displacement and its mean loads
 
     def spread(self, scale2: float) -> None:
-        """Expect equal loads over the whole patch, with the scale s² = ``scale2``, pitch²."""
+        """Expect equal loads over the whole patch, with the scale s² = ``scale2`` in pitch²."""
         self.scale2 = scale2
         self.doubt, self.smooth_share = PRIOR_DOUBT, SMOOTH_SHARE
         self.share[:] = 1.0
@@ -157,7 +157,7 @@ class LoadPrior:
         return True
 
     def set_discs(self, variance: Float, layer: Float, untouched2: float) -> None:
-        """Set the variances of the loads to those of a few loaded cells, and of an untouched skin elsewhere.
+        """Set the load variances for a skin that is untouched except for discs on a few cells.
 
         Args:
             variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, pitch².
@@ -182,11 +182,11 @@ class LoadPrior:
         self._factorise()
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
-        """Return the load variances (Q,) for the next solve, pitch².
+        """Return the load variances (Q,) for the next solve, in pitch².
 
-        Each variance moves halfway from its current value to that of the loads found. With full steps, the
-        variances of neighbouring cells would oscillate. A full step is taken only from equal expected loads,
-        and only if a press is certain.
+        Each variance moves halfway from its current value to the value for the loads found. With full steps,
+        the variances of neighbouring cells would oscillate. A full step is taken only from equal expected
+        loads, and only if a press is certain.
 
         Args:
             found: (Q,) squared loads found in the frame, pitch².
@@ -220,7 +220,7 @@ class LoadPrior:
         return self._loads[1]
 
     def roughness(self, displacement: Float) -> float:
-        """Return uᵀ C⁻¹ u, pitch², for a displacement u (U f,). The array is overwritten.
+        """Return uᵀ C⁻¹ u, in pitch², for a displacement u (U f,). The array is overwritten.
 
         The most likely s² for u is uᵀ C⁻¹ u divided by the number of coordinates.
         """

@@ -5,8 +5,8 @@
 - A Gauss-Newton step computes new factors at the current field, and is followed by chord steps.
 - Annealing starts at rest and assumes a noise of 3 %, which it divides by four in each step until the actual
   noise is reached. At high noise, the posterior has a single maximum, near that of the prior. Following this
-  maximum as the noise decreases usually leads to the correct one, even if a press indents the layer by 70 %
-  of its thickness within one frame.
+  maximum as the noise decreases usually leads to the correct maximum, even if a press indents the layer by
+  70 % of its thickness within one frame.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest, and expect equal loads everywhere with s² = ``scale2``, pitch².
+        """Return to rest, and expect equal loads everywhere with s² = ``scale2`` in pitch².
 
         The memory of the factors is freed, so that a hand needs memory only for the patches in contact.
         """
@@ -211,7 +211,7 @@ class MapEstimator:
         return self._settle(observation) or self.track(observation, members)
 
     def step_s(self, observation: Observation) -> float:
-        """Measure the time to factorise the equations of all wires and compute the standard deviations, s.
+        """Return the time in s to factorise the equations of all wires and compute the standard deviations.
 
         The factors are discarded.
         """
@@ -232,7 +232,7 @@ class MapEstimator:
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit between a frame and a displacement (U, 3N), pitches; None stands for rest."""
+        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None stands for rest."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -252,15 +252,15 @@ class MapEstimator:
         return square + prior + float((g**2 / observation.d).sum())
 
     def roughness(self, moved: Float) -> float:
-        """Return uᵀ C⁻¹ u, pitch², for a displacement u (U, 3N)."""
+        """Return uᵀ C⁻¹ u, in pitch², for a displacement u (U, 3N)."""
         return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
 
     def free_displacement(self) -> Float:
-        """Return the free coordinates (U f,) of the current displacement, pitches."""
+        """Return the free coordinates (U f,) of the current displacement, in pitches."""
         return np.ascontiguousarray(self.moved[:, self._free]).ravel()
 
     def covariance(self) -> Float:
-        """Return the posterior covariance (U f, U f) of the displacement, pitch²."""
+        """Return the posterior covariance (U f, U f) of the displacement, in pitch²."""
         v = self._b.whitened[: self.factored_rows]
         explained = np.empty_like(self.load_prior.covariance)
         multiply(np.ascontiguousarray(v.T), v, explained)
@@ -285,8 +285,8 @@ class MapEstimator:
     def factorise_uniform(self, observation: Observation, scale2: float) -> float:
         """Factorise S for equal loads over the whole patch with s² = ``scale2``; return the log evidence.
 
-        The evidence is that of the last :meth:`linearise`, ln N(y; 0, S) without the constant term. The
-        factors remain until the next step of a solve.
+        The evidence is ln N(y; 0, S), without the constant term, for the data of the last :meth:`linearise`.
+        The factors remain valid until the next solver step.
         """
         b, m = self._b, self.factored_rows
         self._assemble(observation, self.members, scale2, self.moved, self.load_prior.uniform)
@@ -300,7 +300,7 @@ class MapEstimator:
         return float(-0.5 * (b.v[:m] @ b.v[:m]) - np.log(diagonal).sum())
 
     def whitened_data(self) -> Float:
-        """Return L⁻¹ y (m,) of the last :meth:`factorise_uniform`."""
+        """Return L⁻¹ y (m,) from the last :meth:`factorise_uniform`."""
         return self._b.v[: self.factored_rows].copy()
 
     def match(self, data: Float, response_t: Float) -> Float:
@@ -342,7 +342,7 @@ class MapEstimator:
         return self._gamma
 
     def evidence_scale(self, weight: float, scale2: float) -> float:
-        """Return the next s², pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
+        """Return the next s², in pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
 
         Args:
             weight: Weight of the prior on s², as an equivalent number of parameters.
@@ -362,7 +362,7 @@ class MapEstimator:
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Return whether the current factors are valid for the given wires and noise and the prior."""
+        """Return whether the current factors are valid for the given wires and noise, and for the prior."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored

@@ -1,13 +1,13 @@
-"""Fit of soft discs of loads to a frame.
+"""Fits soft load discs to a frame.
 
-The data are linearised at the current displacement, and whitened with the covariance that they would have on
-an untouched skin, whose loads are equally small everywhere. The first disc is placed where the whitened data
-agree best with a load, and fitted (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added
-where the data that remain agree best with a load, as long as the evidence pays for their parameters. In a
-stream, the search starts at the discs of the last frame.
+The data are linearised at the current displacement, and whitened with the covariance expected on an untouched
+skin, whose loads are equally small everywhere. The first disc is placed where a load matches the whitened
+data best, and is then fitted (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a
+load matches the remaining data best, as long as the gain in evidence outweighs the additional parameters. In
+a stream, the search starts at the discs of the last frame.
 
-If equal loads over the whole patch explain the frame better than the discs, or if the loads need many or
-large discs, no disc is used.
+No disc is used if equal loads over the whole patch explain the frame better than the discs, or if the loads
+need many or large discs.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ EXPECTED: Final = 0.1
 """Expected amplitude a of a disc, in clearances per unit load."""
 AMPLITUDE_MOST: Final = 1.6
 """Maximum ln a, relative to the expected value. A much larger load outside the patch could imitate a plate
-on the whole patch."""
+over the whole patch."""
 LAYER_RANGE: Final = (0.02, 5.0)
 """Minimum and maximum layer share β."""
 BEYOND: Final = 1
-"""Maximum distance of the centre of a disc from the outermost electrodes, cells."""
+"""Maximum distance of a disc's centre beyond the outermost electrodes, cells."""
 AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
-"""Distance from the start of a search within which the loads are computed, cells."""
+"""Radius around the start of a search within which the effects of loads are computed, cells."""
 MOST: Final = 4
-"""Number of discs at which the search is given up. Loads that need so many discs are not local."""
+"""Number of discs at which the search is abandoned. Loads that need so many discs are not local."""
 WIDE: Final = 3.0
-"""Radius of a disc, cells, above which the search is given up. On large contacts and plates, discs would
-claim too small standard deviations."""
+"""Disc radius above which the search is abandoned, cells. For large contacts and plates, the standard
+deviations from discs would be too small."""
 PAYS: Final = 2.0
-"""Minimum gain in evidence of a further disc, in addition to the logarithm of the number of parameters."""
+"""Minimum gain in log evidence for a further disc, in excess of the logarithm of the number of parameters."""
 NOTICED: Final = 8.0
-"""Minimum squared match of the remaining data with a load, in noise variances, for a further disc to be
-tried."""
+"""Minimum squared match between a load and the remaining data for a further disc to be tried, in noise
+variances."""
 NEAR: Final = 1.0
-"""Radius of the discs with which the data are compared to find a start, cells."""
+"""Radius of the discs that are matched to the data to find a starting point, cells."""
 
 
 class DiscPrior:
@@ -64,7 +64,7 @@ class DiscPrior:
 
     Attributes:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
-        spread: (U f,) variance of the displacement due to the choice of the discs, pitch².
+        spread: (U f,) variance of the displacement due to the uncertainty of the discs, pitch².
     """
 
     def __init__(
@@ -110,9 +110,9 @@ class DiscPrior:
         *,
         spread: bool,
     ) -> Float | None:
-        """Fit the discs to a frame, and return the variances (2, Q) of the loads, pitch².
+        """Fit the discs to a frame, and return the load variances (2, Q) in pitch².
 
-        The factors of the estimator are overwritten.
+        The estimator's factors are overwritten.
 
         Args:
             observation: The frame.
@@ -171,14 +171,14 @@ class _Search:
         self.evidence = 0.0
 
     def start(self, discs: Float) -> Float:
-        """Improve the discs of the last frame."""
+        """Return the discs of the last frame, refitted to this frame."""
         if not len(discs):
             return discs
         self._include(discs[:, :2])
         return self._climb(discs, 0)
 
     def place_of_next(self, discs: Float) -> Float | None:
-        """Return the cell (2,) where a further disc may be needed, or None."""
+        """Return the cell (2,) where a further disc may be needed; None if no disc is needed."""
         if len(discs) == MOST:
             return None
         left = self._match
@@ -223,7 +223,7 @@ class _Search:
         return found
 
     def _include(self, places: Float) -> None:
-        """Compute the effects of the loads on the cells near ``places`` (P, 2)."""
+        """Compute the effects of loads on the cells near ``places`` (P, 2)."""
         p = self._p
         gap = np.linalg.norm(p._place[:, None] - places, axis=-1).min(axis=1)
         fresh = np.setdiff1d(np.flatnonzero(gap <= REACH), self._cells)
@@ -242,7 +242,7 @@ class _Search:
         )
 
     def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
-        """Add the variance due to a disc that may exist, although the evidence did not pay for it."""
+        """Add the variance due to a disc that may exist although it was rejected."""
         p, effects = self._p, self._effects
         own, other = np.empty((2, effects.match.size))
         kernels.mean_loads(discs, effects, p._scratch, own)
@@ -252,7 +252,7 @@ class _Search:
         p.spread += chance * (1.0 - chance) * (p._response[:, columns] @ (other - own)) ** 2
 
     def measure_spread(self, discs: Float) -> None:
-        """Write the variance of the displacement due to each parameter of the discs."""
+        """Add the variance of the displacement due to the uncertainty of each disc parameter."""
         p, effects = self._p, self._effects
         own, other = np.empty((2, effects.match.size))
         columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()

@@ -1,23 +1,23 @@
-"""Soft discs of loads: variance, evidence and search.
+"""Soft load discs: variance, evidence and search.
 
 A cell has four loads: two shear loads and a normal load on a half-space, and a normal load on a thin bonded
-layer. The last one moves the skin only near the cell, and stands for all displacements that no load on a
+layer. The layer load moves the skin only near the cell, and represents all displacements that no load on a
 half-space can cause. A disc d has a centre (row, column) and a radius R in cells, an amplitude a in units of
 the prior's loads, and a layer share β. It adds the variance a² w to the half-space loads of each cell, and
 a² β² w to the layer load, where
 
     w = 1 / (1 + exp((r − R − ¼) / ¼)),   r: distance of the cell from the centre
 
-The loads of all discs together have the variances v. Let b = BᵀL⁻¹y and M = BᵀB, where B = L⁻¹ J G are the
-whitened effects of the loads on the data y, and L Lᵀ is the covariance of the data of an untouched skin. By
-the Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an
+Let v be the variances of the loads, summed over all discs, b = BᵀL⁻¹y and M = BᵀB. Here, B = L⁻¹ J G are
+the whitened effects of the loads on the data y, and L Lᵀ is the data covariance of an untouched skin. By the
+Woodbury identity and the matrix determinant lemma, the log-likelihood of the data exceeds that of an
 untouched skin by
 
     ½ |Λ⁻¹ V b|² − ln |Λ|,   Λ Λᵀ = I + V M V,   V = diag(√v)
 
 No eigenvalue of I + V M V is less than 1, so the factorisation is as accurate as that of the innovation
-covariance (:mod:`skinnode.solve.posterior.measurement_update`). Its size is four times the number of loaded
-cells, whatever the size of the patch.
+covariance (:mod:`skinnode.solve.posterior.measurement_update`). The matrix size is four times the number
+of loaded cells, regardless of the size of the patch.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from skinnode.solve.linalg.cholesky import cholesky, solve_lower_transposed_vect
 from skinnode.solve.linalg.vectors import Index
 
 SOFT: Final = 0.25
-"""Width of the rim of a disc, cells."""
+"""Rim width of a disc, cells."""
 FAINT: Final = 0.03
-"""Variance of a cell, relative to the largest, below which its loads are neglected in the evidence."""
+"""Load variance of a cell, relative to the largest, below which the cell is neglected in the evidence."""
 RADIUS: Final = 1.5
 """Expected radius of a disc, cells."""
 RADIUS_SPREAD: Final = 0.7
@@ -49,7 +49,7 @@ LAYER: Final = 0.5
 LAYER_SPREAD: Final = 1.5
 """Standard deviation of ln β in the prior of a disc."""
 STEPS: Final = (0.5, 0.5, 0.3, 0.5, 1.0)
-"""First steps of the search in the row, column, ln R, ln a and ln β of a disc."""
+"""Initial search steps in the row, column, ln R, ln a and ln β of a disc."""
 SWEEPS: Final = 3
 """Maximum number of sweeps over all parameters. After a sweep without an improvement, the steps are
 halved."""
@@ -78,7 +78,7 @@ class Scratch(NamedTuple):
     root: Float
     """(2, n) standard deviations of the half-space loads and of the layer load of each cell."""
     cells: Index
-    """(n,) cells with loads."""
+    """(n,) indices of the loaded cells."""
     factor: Float
     """(4n, 4n) I + V M V, overwritten by Λ."""
     vector: Float
@@ -165,7 +165,7 @@ def evidence(discs: Float, effects: Effects, s: Scratch) -> float:
 
 @njit
 def mean_loads(discs: Float, effects: Effects, s: Scratch, q: Float) -> float:
-    """Write the mean loads (4n,) under the discs into ``q``; return the evidence."""
+    """Write the mean loads (4n,) for the discs into ``q``; return the evidence."""
     for i in range(q.size):
         q[i] = 0.0
     count = _factorise(discs, effects, s)
@@ -183,7 +183,7 @@ def mean_loads(discs: Float, effects: Effects, s: Scratch, q: Float) -> float:
 
 @njit
 def log_prior(discs: Float, amplitude: float) -> float:
-    """Return the log prior density of ``discs`` (D, 5) for an expected ln a ``amplitude``."""
+    """Return the log prior density of ``discs`` (D, 5); ``amplitude`` is the expected ln a."""
     total = 0.0
     for d in range(discs.shape[0]):
         wide = (math.log(math.exp(discs[d, 2]) + SOFT) - math.log(RADIUS)) / RADIUS_SPREAD
@@ -208,7 +208,7 @@ def climb(  # noqa: PLR0913 - a kernel: arrays by name
 
     Args:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
-        first: Index of the first disc to improve; those before it stay as they are.
+        first: Index of the first disc to improve; earlier discs do not change.
         effects: Effects of the loads on the data.
         amplitude: Expected ln a.
         bounds: (2, 5) minimum and maximum of each parameter.

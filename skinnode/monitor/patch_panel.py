@@ -33,7 +33,7 @@ def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the height of a map, in lines, with ``columns`` columns of tiles."""
+        """Return the height in lines of a map that has ``columns`` columns of tiles."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0

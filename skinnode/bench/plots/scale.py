@@ -34,9 +34,10 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     for axes in (area, contact, memory):
         axes.grid(visible=True, color="0.9")
     for axes in (area, memory):
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.set_xlabel("patches, one of them touched")
+    area.set_xscale("log", base=2)
+    area.set_xticks(ticks, [str(tick) for tick in ticks])
+    contact.set_xticks([row["touched"] for row in figures["contact"]])
     memory.set_ylabel("memory of the process, MB")
     memory.set_ylim(bottom=0.0)
     contact.set_xlabel(f"touched patches of {figures['contact'][0]['patches']}")

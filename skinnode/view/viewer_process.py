@@ -109,7 +109,7 @@ class ViewerProcess:
         end_s = time.monotonic() + _READY_S
         while time.monotonic() < end_s:
             if self.ended:
-                raise SkinError(f"the viewer ended at once: {self.why()}")
+                raise SkinError(f"the viewer ended: {self.why()}")
             try:
                 socket.create_connection((_reachable(address), port), timeout=1.0).close()
             except OSError:

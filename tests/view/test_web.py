@@ -142,7 +142,7 @@ def test_a_viewer_that_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch, t
     program.write_text("#!/bin/sh\necho 'cannot open the display :7' >&2\nexit 1\n")
     program.chmod(0o700)
     monkeypatch.setattr(viewer_process, "_program", lambda: program)
-    with pytest.raises(SkinError, match="the viewer ended at once: cannot open the display :7"):
+    with pytest.raises(SkinError, match="the viewer ended: cannot open the display :7"):
         ViewerProcess(LOCAL, free_port(), [])
 
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 
 from skinnode.solve.operators import loop
 from skinnode.solve.operators.codes import EPS, LEVENBERG_MARQUARDT, OPERATORS, REJECTED, TRY
-from skinnode.solve.operators.work import LAM, LIMIT, RADIUS, workspace
+from skinnode.solve.operators.work import LAM, LIMIT, NEWTON_LENGTH, RADIUS, workspace
 
 DOGLEG = OPERATORS["dogleg"]
 
@@ -52,6 +52,48 @@ def test_shortened_step_is_the_damped_one_of_the_right_length(n, spare, decades,
     condition = np.sqrt((sigma[0] ** 2 + lam) / lam)
     open_ = condition * (radius + np.linalg.norm(r) / np.sqrt(lam))
     np.testing.assert_allclose(scale * w.step, truth, rtol=0, atol=10 * (n + m) * EPS * open_)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.integers(1, 6),
+    st.integers(0, 3),
+    st.one_of(st.floats(1e-3, 1.0, exclude_max=True), st.just(1.0 - 2.0**-53)),
+    st.integers(0, 2**32 - 1),
+)
+@example(n=1, spare=0, share=1.0 - 2.0**-53, seed=57)
+@example(n=1, spare=1, share=1.0 - 2.0**-53, seed=193)
+def test_the_dogleg_step_ends_where_its_path_leaves_the_trust_region(n, spare, share, seed):
+    """The path leads from 0 to the Cauchy point to the Newton point: by dense algebra in scaled unknowns, its
+    crossing by bisection. With one unknown, the two points are one."""
+    rng = np.random.default_rng(seed)
+    j = rng.normal(size=(n + spare, n)) * 10.0 ** rng.uniform(-6, 6, n)
+    r = rng.normal(size=n + spare)
+    scale = np.linalg.norm(j, axis=0)
+    scaled = j / scale
+    newton = -np.linalg.lstsq(scaled, r, rcond=None)[0]
+    gradient = scaled.T @ r
+    cauchy = -gradient * (gradient @ gradient) / np.sum((scaled @ gradient) ** 2)
+
+    def path(t: float) -> np.ndarray:
+        return t * cauchy if t < 1.0 else cauchy + (t - 1.0) * (newton - cauchy)
+
+    radius = np.inf
+    for _ in range(2):  # the first step is the Newton step and tells its length
+        w = workspace(n, n + spare)
+        w.r[:], w.jt[:] = r, j.T
+        assert loop.start(w) == TRY
+        w.s[RADIUS] = radius
+        assert loop.advance(DOGLEG, w, REJECTED, 0.0, 0.0) == TRY
+        radius = share * w.s[NEWTON_LENGTH]
+    radius = w.s[RADIUS]
+    assert radius < w.s[NEWTON_LENGTH]
+
+    def beyond(t: float) -> float:
+        return float(np.linalg.norm(path(t)) - radius)
+
+    truth = path(brentq(beyond, 0.0, 2.0)) if beyond(2.0) > 0.0 else newton
+    np.testing.assert_allclose(scale * w.step, truth, rtol=0, atol=1e-9 * np.linalg.norm(newton))
 
 
 @settings(max_examples=60, deadline=None)

@@ -35,7 +35,9 @@ def dogleg_step(w: Work) -> None:
         weight = w.scale[j] ** 2
         a += weight * leg * leg
         b += weight * leg * w.step[j]
+    if a == 0.0:  # the Cauchy point is the Newton point, as always with one unknown
+        return
     root = math.sqrt(b * b - a * c)
-    share = -c / (b + root) if b > 0.0 else (root - b) / a
+    share = min(-c / (b + root) if b > 0.0 else (root - b) / a, 1.0)
     for j in range(n):
         w.step[j] += share * (w.newton[j] - w.step[j])

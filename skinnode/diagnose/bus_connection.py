@@ -5,8 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import state_name
@@ -17,6 +16,7 @@ from skinnode.host.link import BusLink
 from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import RemoteOd
+from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5
 """Maximum wait for a heartbeat, s. Heartbeats with a longer period are missed."""
@@ -52,7 +52,7 @@ def no_answer(wrong: str) -> str:
     return f"sends SDO frames that are not responses to the request (newest: {wrong})"
 
 
-class BusConnection:
+class BusConnection(Closing):
     """Open bus; use it in a ``with`` block, or call :meth:`close`.
 
     Args:
@@ -195,14 +195,6 @@ class BusConnection:
         """Close the bus and wait for its receiving thread to end."""
         self._mainline.stop()
         self.link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _beat(self, node_id: int, since_ns: int, within_s: float) -> Beat | None:
         self.wait_until(lambda: self.listener.newest_beat(node_id, since_ns), within_s)

@@ -9,8 +9,8 @@ import functools
 import queue
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType, TracebackType
-from typing import Final, Self
+from types import MappingProxyType
+from typing import Final
 
 from skinnode.host.health import SCANS_MISSED, Condition
 from skinnode.host.publish import Subscription, check_timeout
@@ -20,6 +20,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.hand_contact import HAND, HandContact, Wrench, wrench_of
 from skinnode.model.pose import Pose
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 
 LATE: Final = "late"
 """Reason for a missing field: the patch is operational, but its field missed the deadline."""
@@ -219,7 +220,7 @@ class HandGatherer:
         return LATE if condition is Condition.OPERATIONAL else str(condition)
 
 
-class HandSubscription:
+class HandSubscription(Closing):
     """Subscription to hand frames. Read it with ``for``, ``async for`` or :meth:`get`.
 
     A slow reader loses the oldest fields and gets hand frames with missing fields. ``dropped`` counts the
@@ -292,14 +293,6 @@ class HandSubscription:
                     return
                 self._gatherer.add(field, clock.monotonic_ns())
             yield frame
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
         """Return the next hand frame; None once the host has closed. Raise queue.Empty on timeout."""

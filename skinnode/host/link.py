@@ -6,8 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.canopen.indices import SYNC_COB_ID, sdo_response_cob_id
 from skinnode.config import BusConfig
@@ -17,6 +16,7 @@ from skinnode.host.dispatcher import BusStats, Dispatcher, Handler, PortCounters
 from skinnode.host.retry_pause import Pause
 from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.transport import CanPort, Frame, Intake
 
 _log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ _REOPEN_S: Final = 0.1
 """Pause (s) before each attempt to reopen a failed interface."""
 
 
-class BusLink(Dispatcher):
+class BusLink(Dispatcher, Closing):
     """Connection to a bus, open from construction until :meth:`close` or the end of a ``with`` block.
 
     If a handler, poller, listener or job raises an exception, only the current frame or call is lost. If the
@@ -171,14 +171,6 @@ class BusLink(Dispatcher):
     def close(self) -> None:
         """Close the interface. Call only after the mainline has ended."""
         self._port.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     # --- called by the mainline
 

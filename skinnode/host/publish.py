@@ -9,14 +9,13 @@ import queue
 import threading
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator
-from types import TracebackType
-from typing import Self
 
 from skinnode.errors import SkinError
 from skinnode.host.containment import Defects
 from skinnode.host.drop_oldest_queue import DropOldestQueue, End
 from skinnode.host.touch_changes import TouchChanges
 from skinnode.model.frames import FieldFrame
+from skinnode.process.closing import Closing
 
 
 def check_timeout(timeout_s: float | None) -> None:
@@ -39,7 +38,7 @@ def check_capacity(capacity: int) -> None:
         raise ValueError(f"capacity: got {capacity!r}, must be an integer of at least 1")
 
 
-class Subscription:
+class Subscription(Closing):
     """Subscription to fields. Read it with ``for``, ``async for`` or :meth:`get`.
 
     Fields are delivered in the order of publication. A full queue drops its oldest field; ``dropped`` counts
@@ -152,14 +151,6 @@ class Subscription:
 
     def _too_long(self) -> TimeoutError:
         return TimeoutError(f"no field within {self._timeout_s} s")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
         """Queue a field of a subscribed patch, or an end marker. Any thread.

@@ -29,8 +29,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtState
@@ -40,6 +39,7 @@ from skinnode.host.node_supervision import NodeSupervision
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.supervised import LEAST_NS, NodeStats, Phase, Supervised
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ _TURN_S: Final = 0.02
 """Interval (s) between checks of all nodes."""
 
 
-class Supervisor:
+class Supervisor(Closing):
     """Supervisor of all nodes, running from construction until :meth:`close`.
 
     The supervisor also sends the host's heartbeats.
@@ -112,14 +112,6 @@ class Supervisor:
         for node in self._nodes:
             node.abandon.set()
         self._pool.shutdown(cancel_futures=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     # --- supervisor's thread
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from skinnode.canopen.indices import SYNC_COB_ID
 from skinnode.errors import BusError
 from skinnode.host.containment import Defects, keep_on
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 
 
 class Tick(NamedTuple):
@@ -94,7 +94,7 @@ class SyncFollower:
 Send = Callable[[int, bytes], None]
 
 
-class SyncProducer:
+class SyncProducer(Closing):
     """Producer of SYNC on one or more buses, simultaneous or staggered, until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
@@ -134,14 +134,6 @@ class SyncProducer:
         """Stop sending SYNC, and join the sending thread."""
         self._stop.set()
         self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _run(self) -> None:
         self._due_ns = clock.monotonic_ns()

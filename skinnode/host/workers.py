@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
-from types import TracebackType
-from typing import Self
 
 from skinnode.host.containment import Defects, keep_on
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
 """Error handler of a job, called on the same thread as the job. It must not raise."""
 
 
-class Workers:
+class Workers(Closing):
     """Pool of ``count`` worker threads, running from construction until :meth:`close`.
 
     Any thread may submit jobs. Exceptions outside the jobs are reported to ``defects``.
@@ -43,14 +42,6 @@ class Workers:
             self._jobs.put(None)
         for thread in self._threads:
             thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "taking a job")

@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
@@ -23,6 +22,7 @@ from skinnode.host.health_watch import HealthWatch
 from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
@@ -105,7 +105,7 @@ class Source(Protocol):
         """Release the source's resources."""
 
 
-class HostSource:
+class HostSource(Closing):
     """Data source for a running host. The caller must close the host."""
 
     live = True
@@ -195,16 +195,8 @@ class HostSource:
             self.stop_recording()
         self._fields.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class ReplaySource:
+class ReplaySource(Closing):
     """Data source that replays a recording on a separate thread, from construction to :meth:`close`."""
 
     live = False
@@ -283,14 +275,6 @@ class ReplaySource:
         self._run.stop()
         self._thread.join()
         self._running.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _play(self) -> None:
         try:

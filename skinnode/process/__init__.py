@@ -1,1 +1,1 @@
-"""Process-wide facilities: clock, signal handling, child processes and garbage collection."""
+"""Process-wide facilities: clock, signals, child processes, garbage collection, closing of resources."""

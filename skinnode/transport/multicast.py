@@ -10,6 +10,9 @@ converts each kind of frame only once:
 - A received packet is compared, without its timestamp and data, with the packets that python-can has already
   unpacked. If the packet differs from all of these or has another layout, python-can unpacks it.
 
+Like python-can's interface, this one has no arbitration and does not guarantee delivery or order: it is meant
+for tests of programs, not of a bus under load.
+
 Packets are received in batches, with kernel timestamps and the kernel's drop counter. A sender also receives
 its own packets. The sender skips these packets, which it identifies by a tag in the channel field. python-can
 transmits this field but does not use it.

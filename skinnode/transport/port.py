@@ -11,14 +11,14 @@ import difflib
 import errno
 import logging
 import threading
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import can
 
 from skinnode.canopen.data_length import fd_length
 from skinnode.errors import BusError
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_interface import FrameInterface
@@ -125,7 +125,7 @@ def _where(config: BusConfig) -> str:
     return f"{config.name}: interface {config.interface!r}, channel {config.channel!r}"
 
 
-class CanPort:
+class CanPort(Closing):
     """Endpoint on a CAN bus, open until :meth:`close` is called or a ``with`` block ends.
 
     An endpoint does not receive its own frames. Configuration files and environment variables of python-can
@@ -363,14 +363,6 @@ class CanPort:
         if not self._closed:
             self._closed = True
             self._shutdown()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         return f"<CanPort {self._where}>"

@@ -12,10 +12,10 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
@@ -202,7 +202,7 @@ class _Shared:
     poll: select.poll
 
 
-class Receiver:
+class Receiver(Closing):
     """Receives frames from several ports until :meth:`close` is called.
 
     All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Each other port has
@@ -256,14 +256,6 @@ class Receiver:
             thread.join()
         if self._shared is not None:
             self._shared.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _receive_batches(self) -> None:
         shared = _Shared({}, select.poll())

@@ -11,13 +11,13 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.model.frames import FieldFrame, amended
 from skinnode.process.child_processes import starting_children
+from skinnode.process.closing import Closing
 from skinnode.view.outputs import Target
 from skinnode.view.tick import Tick
 
@@ -36,7 +36,7 @@ class DrawingOptions:
     live: bool
 
 
-class DrawingProcess:
+class DrawingProcess(Closing):
     """Child process that draws ticks from construction until :meth:`close`, or until this process exits.
 
     Args:
@@ -84,14 +84,6 @@ class DrawingProcess:
             self._process.kill()
             self._process.join()
         self._process.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _complaint(self) -> str:
         """Return the reason why the child process has ended."""

@@ -8,8 +8,7 @@ the host.
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.errors import SkinError
 from skinnode.model.frames import FieldFrame
@@ -17,6 +16,7 @@ from skinnode.monitor.report import FaultBook
 from skinnode.monitor.source import Source
 from skinnode.monitor.view_model import History
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.view.texts import DrawnCounts
 from skinnode.view.tick import Tick
 
@@ -28,7 +28,7 @@ _QUEUED: Final = 8
 """Capacity of the queue, in fields per patch."""
 
 
-class DrawingThread:
+class DrawingThread(Closing):
     """Thread that draws a source, from construction until :meth:`close`.
 
     Args:
@@ -60,14 +60,6 @@ class DrawingThread:
         self._stop.set()
         self._thread.join()
         self._fields.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _run(self) -> None:
         ending = False

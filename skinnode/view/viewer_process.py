@@ -19,11 +19,11 @@ import tempfile
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.errors import ConfigError, Shown, SkinError
 from skinnode.process.child_processes import starting_children
+from skinnode.process.closing import Closing
 
 LOCAL: Final = "127.0.0.1"
 MEMORY: Final = "512MB"
@@ -35,7 +35,7 @@ _PR_SET_PDEATHSIG: Final = 1
 """``prctl`` option: signal that the kernel sends to a child when its parent ends (prctl(2))."""
 
 
-class ViewerProcess:
+class ViewerProcess(Closing):
     """Child process that receives data on a TCP port until :meth:`close`, or until this process exits.
 
     Args:
@@ -96,14 +96,6 @@ class ViewerProcess:
             self._process.kill()
             self._process.wait()
         self._folder.cleanup()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _wait_until_it_listens(self, address: str, port: int) -> None:
         end_s = time.monotonic() + _READY_S

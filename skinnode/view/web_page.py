@@ -14,10 +14,10 @@ import shutil
 import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+from skinnode.process.closing import Closing
 from skinnode.view.viewer_process import LOCAL, require_free
 
 _FILES: Final = ("/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/apple-touch-icon.png")
@@ -34,7 +34,7 @@ _OPTIONS: Final = {"hide_welcome_screen": "1", "persist": "0"}
 """Page query: disables the welcome screen, which loads examples, and the saved layout of an earlier visit."""
 
 
-class WebPage:
+class WebPage(Closing):
     """Web server of the viewer's page, from construction until :meth:`close`.
 
     Args:
@@ -65,14 +65,6 @@ class WebPage:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def policy(host: str, data_port: int) -> str:

@@ -40,7 +40,7 @@ def conformance(
         bool, typer.Option("--list", help="Print the IDs, titles and clauses of the cases, and exit.")
     ] = False,
 ) -> None:
-    """Test a node against CiA 301 with raw frames; print one line for each of 127 cases.
+    """Test a node against CiA 301 with raw frames; print one line for each case.
 
     The command RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
     parameters. The node's configuration is read first and restored at the end. The command addresses some

@@ -1,4 +1,4 @@
-"""Conformance suite for CANopen nodes: 127 cases that test any node on any CAN interface.
+"""Conformance suite for CANopen nodes: cases that test any node on any CAN interface.
 
 ``eds_reader`` parses the EDS of the node, and ``tester`` sends and receives raw frames. ``sdo`` is the SDO
 client, ``dut`` represents the device under test, and ``cases`` contains the cases. ``run`` runs them, and

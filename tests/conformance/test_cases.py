@@ -34,7 +34,7 @@ PLAN = {
     "STATE": 4,
     "TRANS": 4,
 }
-"""Cases an area of a CiA conformance plan has."""
+"""Number of cases in each area of a CiA conformance plan. No other file contains these numbers."""
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
@@ -53,7 +53,6 @@ def test_patch(case: Case, dut: Dut) -> None:
 
 def test_the_cases_are_those_of_the_plan() -> None:
     ids = [f"{area}-{number:02}" for area, count in PLAN.items() for number in range(1, count + 1)]
-    assert len(ids) == 127
     assert [case.id for case in CASES] == ids
     assert Counter(case.area for case in CASES) == PLAN
 

@@ -16,7 +16,7 @@ from skinnode.canopen.nmt import NmtCommand
 from skinnode.errors import BusError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, PatchNode
-from skinnode.node.clock import THRIFTY, Pacing
+from skinnode.node.pacing import THRIFTY, Pacing
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile

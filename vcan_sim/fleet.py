@@ -17,14 +17,14 @@ from skinnode.node import NmtState, NodeRunner
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.profile import PatchProfile
 from vcan_sim.bus_attacker import BusFaults, InjectedOnBus
+from vcan_sim.default_scene import Scene
 from vcan_sim.fault_player import FaultPlayer
 from vcan_sim.faults import NO_FAULTS, Faults, Injected, check_wires
 from vcan_sim.faulty_bus import FaultyBus, FaultyPort, Passed
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.fleet_faults import FleetFaults, Places
-from vcan_sim.scene import Scene
 from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene, schedule_of
-from vcan_sim.sensor import SimulatedPatch, SkinMotion
+from vcan_sim.simulated_patch import SimulatedPatch, SkinMotion
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 

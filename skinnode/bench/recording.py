@@ -25,9 +25,9 @@ from skinnode.model.frames import FieldFrame
 from skinnode.record.journal import SUFFIX, Header
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import McapFile
+from skinnode.record.open_recording import open_log
 from skinnode.record.recorder import FLUSH_S
 from skinnode.record.replay import Replay
-from skinnode.record.sources import open_log
 from skinnode.transport.frame import Frame
 from skinnode.transport.socketcan import HEADER
 

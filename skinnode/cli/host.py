@@ -12,7 +12,7 @@ import typer
 from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
 
 if TYPE_CHECKING:
-    from skinnode.cli._host_report import Report
+    from skinnode.cli._run_report import Report
     from skinnode.config import HandConfig
     from skinnode.host import Host
     from skinnode.host.events import EventSubscription
@@ -41,7 +41,7 @@ def host(
     from skinnode.config import load_hand
 
     plan = load_hand(hand).on(interface, channel)  # before the imports that take a second
-    from skinnode.cli._host_report import JsonReport, TextReport
+    from skinnode.cli._run_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold
     from skinnode.host.scan_solver import check_solvable
     from skinnode.process.signals import stop_on_signal
@@ -62,7 +62,7 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
 
     The host logs each frame whose content does not match its identifier; Python prints the log on stderr.
     """
-    from skinnode.cli._host_report import faults_and_notes, final_state_text, operational_text
+    from skinnode.cli._run_report import faults_and_notes, final_state_text, operational_text
     from skinnode.host import BringUpCancelled, Host
     from skinnode.process.garbage_collection import without_long_collections
 
@@ -93,7 +93,7 @@ def _note_touches(events: EventSubscription, report: Report) -> None:
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
     """Collect the fields, report touches as they happen and the host every second, until the end."""
-    from skinnode.cli._host_report import Second
+    from skinnode.cli._run_report import Second
 
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds

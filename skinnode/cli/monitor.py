@@ -135,7 +135,7 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
 
 def _print(source: Source, stop: threading.Event, seconds: float | None) -> list[str]:
     """Print one JSON line per second and return the faults. Raises the SkinError that stopped the source."""
-    from skinnode.monitor.report import FaultBook, watch
+    from skinnode.monitor.session_faults import FaultBook, watch
     from skinnode.text.json_values import plain
 
     faults = FaultBook(live=source.live)

@@ -86,7 +86,7 @@ def node(
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable
     from skinnode.node import NodeRunner, PatchNode
-    from skinnode.node.clock import EXACT, THRIFTY
+    from skinnode.node.pacing import EXACT, THRIFTY
     from skinnode.node.patch.find_source import make_source
     from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal

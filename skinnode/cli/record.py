@@ -81,7 +81,7 @@ def _run(
     plan: HandConfig, recorder: Recorder, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
     """Run and record the hand; return its faults, one line each."""
-    from skinnode.cli._host_report import faults_and_notes
+    from skinnode.cli._run_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.scan_solver import check_solvable
     from skinnode.record import followed

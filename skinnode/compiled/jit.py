@@ -36,7 +36,7 @@ _KERNEL_FILES = (
     "solve/*/*.py",
     "solve/posterior/local/*.py",
     "bus_load/stuffing.py",
-    "host/code_runs.py",
+    "host/repeated_codes.py",
 )
 
 

@@ -7,8 +7,8 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
     receive thread -> link (receive queue) -> mainline -> dispatcher (calls the handlers set up in reception)
         -> patch_stream (assembles scans) -> code_watch (selects usable codes) -> workers, scan_solver
         -> publish (subscriptions, drop_oldest_queue) -> callback, hand_frame
-    code_watch: code_runs -> converter_liveness (frozen patches), frozen_parts (frozen wires and crossings),
-        noisy_and_drifting_wires, open_and_shorted_wires
+    code_watch: repeated_codes -> converter_liveness (frozen patches), frozen_parts (frozen wires and
+        crossings), noisy_and_drifting_wires, open_and_shorted_wires
 
     start (brings up all nodes) -> remote_node -> configurator (configures one node), sdo_client, lss_master
     supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.host import code_runs
+from skinnode.host import repeated_codes
 from skinnode.host.converter_liveness import Alive, ConverterLiveness
 from skinnode.host.frozen_parts import FrozenParts
 from skinnode.host.noisy_and_drifting_wires import WireWindows
@@ -83,9 +83,9 @@ class CodeWatch:
         self._windows = WireWindows(scale, relative_noise)
         self._life = ConverterLiveness(scale, relative_noise)
         self._parts: FrozenParts | None = None  # the first scan determines the shape
-        self._state = code_runs.new_runs((0, 0))
+        self._state = repeated_codes.new_runs((0, 0))
         self._found = np.zeros(8, np.int64)
-        code_runs.compile_kernels()
+        repeated_codes.compile_kernels()
         self._seen_windows = 0
         self._broken: tuple[WireFault, ...] = ()
         # broken wire, or None for the whole patch -> number of the scan in which the fault was found
@@ -121,12 +121,12 @@ class CodeWatch:
         """
         parts = self._parts
         if parts is None:
-            self._state = code_runs.new_runs((scan.codes.shape[0], scan.codes.shape[1]))
+            self._state = repeated_codes.new_runs((scan.codes.shape[0], scan.codes.shape[1]))
             parts = self._parts = FrozenParts(self._scale, self._relative_noise, self._state)
-        parts.limits[code_runs.FRESH] = not scan.flags & _CHANGED_ONLY
-        code_runs.follow(scan.codes, self._state, parts.limits, self._found)
+        parts.limits[repeated_codes.FRESH] = not scan.flags & _CHANGED_ONLY
+        repeated_codes.follow(scan.codes, self._state, parts.limits, self._found)
         measured, changed, returned, largest, reserved, least, released, suspect = self._found.tolist()
-        last, run = self._state[code_runs.LAST], self._state[code_runs.RUN]
+        last, run = self._state[repeated_codes.LAST], self._state[repeated_codes.RUN]
         self._life.on_scan(scan, (measured, changed, returned, largest, least), last, run)
         number = scan.scan if number is None else number
         if released:

@@ -37,8 +37,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.host.code_runs import LEAST_RUN
 from skinnode.host.repeat_odds import deviations_of, log_stay, log_stay_anywhere
+from skinnode.host.repeated_codes import LEAST_RUN
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.scan import Scan
 from skinnode.protocol.summary import SummaryFlag
@@ -175,7 +175,7 @@ class ConverterLiveness:
 
         Args:
             scan: Scan to evaluate.
-            counts: Results of :func:`~skinnode.host.code_runs.follow`: ``MEASURED``, ``CHANGED``,
+            counts: Results of :func:`~skinnode.host.repeated_codes.follow`: ``MEASURED``, ``CHANGED``,
                 ``RETURNED``, ``LARGEST`` and ``LEAST``.
             last: (U, K) newest code of each crossing.
             run: (U, K) number of scans since the code last changed.

@@ -7,7 +7,7 @@ import queue
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 from skinnode.host.containment import Defects
 from skinnode.host.drop_oldest_queue import DropOldestQueue, End
@@ -18,6 +18,16 @@ _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
 """Default length of a subscriber's queue, in events."""
+
+Severity = Literal["good", "note", "bad"]
+_GOOD: Final = frozenset(
+    (
+        *("operational", "well", "back", "SYNC", "error active", "rejoins"),
+        *("readmitted", "baselines", "touched", "released"),
+    )
+)
+_NOTE: Final = frozenset(("booting", "boot_ups", "foreign", "noisy", "drifting", "left out"))
+"""Types of events that are no faults, and of those that may become faults."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +47,13 @@ class HealthEvent:
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}"
+
+    @property
+    def severity(self) -> Severity:
+        """How serious the change is: ``good``, ``note`` or ``bad``."""
+        if self.what in _GOOD:
+            return "good"
+        return "note" if self.what in _NOTE else "bad"
 
 
 class EventSubscription:

@@ -3,8 +3,8 @@
 **Movement.** A crossing is frozen if its code stays constant while the codes of all four neighbours rise, or
 all fall, by at least ``CROSSING_LEAD``. A wire is frozen if all its codes stay constant while, at ``LEADS``
 or more crossings, the codes of both adjacent wires rise, or both fall, by at least ``WIRE_LEAD``. This change
-of the neighbours' codes is called the lead (:mod:`skinnode.host.code_runs`). The criteria do not depend on
-the converter's noise.
+of the neighbours' codes is called the lead (:mod:`skinnode.host.repeated_codes`). The criteria do not depend
+on the converter's noise.
 
 Both limits are based on simulated presses of patches without faults:
 
@@ -30,7 +30,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.host.code_runs import (
+from skinnode.host.converter_liveness import FALSE_ALARM, QUIETER
+from skinnode.host.repeat_odds import deviations_of, log_stay
+from skinnode.host.repeated_codes import (
     ACROSS,
     ALONG,
     CROSSING,
@@ -43,10 +45,8 @@ from skinnode.host.code_runs import (
     STEPS,
     UPPER,
 )
-from skinnode.host.code_runs import CROSSING_LEAD as _CROSSING_LEAD
-from skinnode.host.code_runs import WIRE_LEAD as _WIRE_LEAD
-from skinnode.host.converter_liveness import FALSE_ALARM, QUIETER
-from skinnode.host.repeat_odds import deviations_of, log_stay
+from skinnode.host.repeated_codes import CROSSING_LEAD as _CROSSING_LEAD
+from skinnode.host.repeated_codes import WIRE_LEAD as _WIRE_LEAD
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale
 
@@ -71,7 +71,7 @@ class FrozenParts:
     Args:
         scale: Scale of the codes.
         relative_noise: Converter noise stated in the hand file, relative to the resistance.
-        state: State array of :mod:`skinnode.host.code_runs`. The detector sets its plane ``NAMED``.
+        state: State array of :mod:`skinnode.host.repeated_codes`. The detector sets its plane ``NAMED``.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:

@@ -26,8 +26,8 @@ _LEVEL: Final = {
     Condition.LOST: STALE,
 }
 """Diagnostic level of each condition; every other condition is an error."""
-_INFO, _WARN = 20, 30
-"""Levels of ``rcl_interfaces/Log``."""
+_LOG_LEVEL: Final = {"good": 20, "note": 30, "bad": 40}
+"""Level of an event in ``rcl_interfaces/Log``: INFO, WARN or ERROR."""
 
 
 def diagnostics(
@@ -78,7 +78,7 @@ def log_message(event: HealthEvent, t_ns: int) -> Any:
         event: The event.
         t_ns: Event time since 1970, ns.
     """
-    level = _INFO if event.what in (Condition.OPERATIONAL, Condition.BOOTING, "baselines") else _WARN
+    level = _LOG_LEVEL[event.severity]
     return message_type(LOG)(time_of(t_ns), level, event.subject, event.text, "skinnode", event.what, 0)
 
 

@@ -17,8 +17,8 @@ from textual.binding import Binding, BindingType
 
 from skinnode.errors import SkinError
 from skinnode.monitor.field_map import Colours, Scale
-from skinnode.monitor.report import FaultBook
 from skinnode.monitor.screen import screen
+from skinnode.monitor.session_faults import FaultBook
 from skinnode.monitor.source import Source
 from skinnode.monitor.terminal_driver import PatientDriver
 from skinnode.monitor.theme import Paint, UiState, theme_for

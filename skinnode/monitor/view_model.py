@@ -316,12 +316,7 @@ def _bus_view(
 
 def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
     """Return an event as a line of the event log."""
-    level: Level = "bad"
-    if event.what in ("operational", "well", "back", "rejoins", "baselines", "readmitted"):
-        level = "good"
-    elif event.what in ("booting", "boot_ups", "foreign", "noisy", "drifting", "left out"):
-        level = "note"
-    return LogLine(time_of_day(event.t_ns + wall_minus_mono_ns), event.subject, event.text, level)
+    return LogLine(time_of_day(event.t_ns + wall_minus_mono_ns), event.subject, event.text, event.severity)
 
 
 def time_of_day(t_ns: int) -> str:

@@ -7,9 +7,9 @@ which measures the skin and sends scans.
 
 from skinnode.canopen.lss import NOT_CONFIGURED
 from skinnode.canopen.nmt import NmtState
-from skinnode.node.clock import EXACT, THRIFTY, Pacing
 from skinnode.node.memory import Memory, VolatileMemory
 from skinnode.node.memory_file import FileMemory
+from skinnode.node.pacing import EXACT, THRIFTY, Pacing
 from skinnode.node.patch.patch_node import PatchNode
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.node.runner import NodeRunner

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from skinnode.node.clock import Clock
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import Clock
 from skinnode.node.pdo.tpdo import TpdoEngine
 from skinnode.node.storage import Storage
 

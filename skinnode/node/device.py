@@ -19,13 +19,13 @@ from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress
 from skinnode.canopen.nmt import NmtCommand, NmtState
 from skinnode.node.application import Application, ApplicationServices
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.lss import BitRateChange, LssSlave
 from skinnode.node.memory import Memory
 from skinnode.node.nmt import NmtSlave
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.rpdo import RpdoEngine
 from skinnode.node.pdo.tpdo import TpdoEngine
 from skinnode.node.rejected import Rejected, RejectedFrames

@@ -12,8 +12,8 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.errors import BusError
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16

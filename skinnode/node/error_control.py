@@ -14,9 +14,9 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import NmtState
 from skinnode.errors import BusError
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.rejected import Rejected
 from skinnode.node.services import NodeServices
 

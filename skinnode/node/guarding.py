@@ -7,9 +7,9 @@ from collections.abc import Callable
 from skinnode.canopen import indices as od
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import GUARD_TOGGLE, NmtState
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 
 
 class Guarding:

@@ -10,9 +10,9 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import NmtState
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 
 _BOOTED: Final = 1
 """Second manufacturer-specific byte of the emergency message if a monitored node has restarted; 0 if its

@@ -20,7 +20,7 @@ from skinnode.canopen.lss import (
     LssCommand,
     LssState,
 )
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.pacing import NO_DEADLINE_NS
 
 _CIA_301_TABLE: Final = 0
 

@@ -9,7 +9,7 @@ from typing import Final, Self
 
 from skinnode.canopen.lss import NOT_CONFIGURED
 from skinnode.errors import BusError
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.patch.patch_node import PatchNode
 from skinnode.process import clock
 from skinnode.transport.bus_state import BusState, bus_state

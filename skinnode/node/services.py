@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from skinnode.node.clock import Clock
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import Clock
 from skinnode.node.rejected import RejectedFrames
 
 Send = Callable[[int, bytes], None]

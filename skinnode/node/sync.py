@@ -7,9 +7,9 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import EmcyCode
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 from skinnode.node.rejected import Rejected
 from skinnode.node.services import NodeServices

@@ -12,8 +12,8 @@ from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
-from skinnode.node.clock import Clock
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import Clock
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _CONSUMES: Final = 1 << 31

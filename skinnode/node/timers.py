@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.pacing import NO_DEADLINE_NS
 
 
 class Timers:

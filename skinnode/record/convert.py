@@ -22,9 +22,9 @@ from skinnode.record.journal import SUFFIX
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import MCAP, McapFile
 from skinnode.record.npz_file import NpzFile, read_npz
+from skinnode.record.open_recording import FRAME_FILES, Frames, OpenRecording, open_log, open_recording
 from skinnode.record.parquet_file import ParquetFile, read_parquet
 from skinnode.record.replay import Replay
-from skinnode.record.sources import FRAME_FILES, Frames, OpenRecording, open_log, open_recording
 from skinnode.transport.frame_log import WRITABLE, LoggedFrame
 from skinnode.transport.frame_log_reader import Damage
 
@@ -68,7 +68,7 @@ def convert(
     Args:
         source: Existing file.
         target: New file.
-        hand: Hand for a log without a journal; see :func:`skinnode.record.sources.open_log`.
+        hand: Hand for a log without a journal; see :func:`skinnode.record.open_recording.open_log`.
         frames_only: Whether to omit the fields from an MCAP file.
 
     Raises:

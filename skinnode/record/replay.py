@@ -31,8 +31,8 @@ from skinnode.host.publish import Publisher
 from skinnode.model.frames import FieldFrame, ResistanceFrame
 from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
+from skinnode.record.open_recording import OpenRecording, open_log, open_recording
 from skinnode.record.replayed_bus import ReplayedBus
-from skinnode.record.sources import OpenRecording, open_log, open_recording
 from skinnode.text.words import counted
 from skinnode.transport.frame_log import LoggedFrame
 
@@ -71,7 +71,7 @@ def replay(
         speed: Replay speed relative to the recording: 2 is twice as fast; None replays as fast as possible.
         cancelled: Function called before each frame; returning True has the effect of :meth:`Replay.stop`.
         hand: Hand for a log without a journal, such as a candump log of another master; a journal is then
-            not read. See :func:`skinnode.record.sources.open_log`.
+            not read. See :func:`skinnode.record.open_recording.open_log`.
 
     Raises:
         ConfigError: The recording cannot be read, or ``speed`` is not positive.

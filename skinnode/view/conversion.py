@@ -13,7 +13,7 @@ from typing import Final
 from skinnode.host.events import Events
 from skinnode.host.health_watch import HealthWatch
 from skinnode.model.frames import FieldFrame
-from skinnode.monitor.report import FaultBook
+from skinnode.monitor.session_faults import FaultBook
 from skinnode.monitor.source import bus_health_in, drain, health_in, snapshot_of
 from skinnode.monitor.view_model import History
 from skinnode.record import Replay, replay

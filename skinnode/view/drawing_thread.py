@@ -12,7 +12,7 @@ from typing import Final
 
 from skinnode.errors import SkinError
 from skinnode.model.frames import FieldFrame
-from skinnode.monitor.report import FaultBook
+from skinnode.monitor.session_faults import FaultBook
 from skinnode.monitor.source import Source
 from skinnode.monitor.view_model import History
 from skinnode.process import clock

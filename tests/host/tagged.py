@@ -11,7 +11,7 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
 from skinnode.protocol.scan import Scan
-from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.simulated_patch import SimulatedPatch
 
 STEP = 1.0 / 65532
 """Of R/R0: one code of 16 bits."""

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from skinnode.config import SimulationConfig
-from skinnode.host.code_runs import LEAST_RUN
 from skinnode.host.code_watch import CodeWatch, Verdict
 from skinnode.host.converter_liveness import Alive
 from skinnode.host.open_and_shorted_wires import WireFault, WireState
+from skinnode.host.repeated_codes import LEAST_RUN
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.codes import MISSING, CodeScale, encode
 from skinnode.protocol.scan import Scan
 from skinnode.protocol.summary import SummaryFlag
-from vcan_sim.scene import Scene
-from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.default_scene import Scene
+from vcan_sim.simulated_patch import SimulatedPatch
 
 SHAPE = (4, 12)
 NOISE = 3e-6

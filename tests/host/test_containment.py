@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from skinnode.bus_load.timing import BusLoad
-from skinnode.cli._host_report import faults_and_notes
+from skinnode.cli._run_report import faults_and_notes
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import SkinError
 from skinnode.host import Condition, Host, containment, retry_pause

@@ -5,7 +5,7 @@ from __future__ import annotations
 import can
 import pytest
 
-from skinnode.cli._host_report import faults_and_notes
+from skinnode.cli._run_report import faults_and_notes
 from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Host
 from skinnode.host.accounting import discrepancies, losses_of_bus

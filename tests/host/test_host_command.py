@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from skinnode.cli._host_report import faults_and_notes, final_state_text, operational_text
+from skinnode.cli._run_report import faults_and_notes, final_state_text, operational_text
 from skinnode.cli.main import main
 from skinnode.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.host import Host
@@ -27,7 +27,7 @@ from skinnode.transport.receiver import drain
 from vcan_sim.commands.run import _too_slow
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
-from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.simulated_patch import SimulatedPatch
 
 from .conftest import SMALL, eventually
 
@@ -389,8 +389,8 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
         assert eventually(lambda: faults_and_notes(host)[0] == [])
         notes = faults_and_notes(host)[1]
         assert any("because the computer running the node could not keep up" in note for note in notes), notes
-        monkeypatch.setattr("skinnode.cli._host_report._OVERRUN_S", 0.0)  # it is not waited for
-        monkeypatch.setattr("skinnode.cli._host_report._OVERRUN_SYNCS", 0)
+        monkeypatch.setattr("skinnode.cli._run_report._OVERRUN_S", 0.0)  # it is not waited for
+        monkeypatch.setattr("skinnode.cli._run_report._OVERRUN_SYNCS", 0)
         assert held_up_until(sources[0], faulty_and_a_note)
         monkeypatch.undo()
         after = fleet.report()

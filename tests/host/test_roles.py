@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.cli._host_report import faults_and_notes
+from skinnode.cli._run_report import faults_and_notes
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError, NodeError
 from skinnode.host import Condition, Host

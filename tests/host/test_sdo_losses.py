@@ -16,8 +16,8 @@ from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 from skinnode.errors import NodeError
 from skinnode.host import sdo_streams
 from skinnode.host.sdo_client import RemoteOd, SkinNetwork
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.sdo.server import SdoServer
 
 DOMAIN, NUMBER = 0x2301, 0x1017

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from skinnode.cli._host_report import _patch_text
+from skinnode.cli._run_report import _patch_text
 from skinnode.host.trust_report import trust_table
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.frames import FieldFrame, SolveStats

@@ -111,6 +111,21 @@ def test_health_becomes_a_level_a_message_and_every_known_value() -> None:
     assert "scan_age_s" not in values  # unknown
 
 
+@pytest.mark.parametrize(
+    ("what", "log_level", "colour"),
+    [("touched", 20, "good"), ("back", 20, "good"), ("booting", 30, "note"), ("lost", 40, "bad")],
+)
+def test_an_event_is_as_serious_in_a_recording_as_in_the_monitor(what, log_level, colour) -> None:
+    from skinnode.host.events import HealthEvent
+    from skinnode.messages.health import log_message
+    from skinnode.monitor.view_model import log_line
+
+    event = HealthEvent(T_NS, "palm", what, "text")
+    name = "rcl_interfaces/msg/Log"
+    assert decode(encode(log_message(event, T_NS), name), name).level == log_level
+    assert log_line(event, 0).level == colour
+
+
 def test_masks_and_numbers_of_a_point_cloud_keep_their_order() -> None:
     from skinnode.messages.fields import CLOUD_FIELDS, point_cloud
     from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats

@@ -16,7 +16,7 @@ from skinnode.config import BusConfig
 from skinnode.errors import BusError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, NodeRunner, PatchNode
-from skinnode.node.clock import THRIFTY
+from skinnode.node.pacing import THRIFTY
 from skinnode.protocol.eds_files import eds_text
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort

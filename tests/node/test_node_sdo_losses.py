@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 from skinnode.errors import BusError
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.sdo.server import SdoServer
 
 INDEX = 0x2301

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.timers import Timers
 
 STEPS = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 50) | st.just(NO_DEADLINE_NS)), max_size=200)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skinnode.config import SimulationConfig
 from skinnode.model.layout import PatchLayout
-from vcan_sim.scene import Scene
+from vcan_sim.default_scene import Scene
 from vcan_sim.skin.crossbar import Side, floating_ohm, grounded_ohm
 from vcan_sim.skin.imperfections import Imperfections
 from vcan_sim.skin.patch import PhysicalPatch

@@ -10,7 +10,7 @@ import pytest
 
 from skinnode.config import SimulationConfig
 from skinnode.model.layout import PatchLayout
-from vcan_sim.scene import LEAD_S, Scene
+from vcan_sim.default_scene import LEAD_S, Scene
 
 LAYOUT = PatchLayout.preset("staggered", height_m=2e-3)
 OPTIONS = SimulationConfig(seed=3, depth=0.15, shear_ratio=0.3, slide_speed_m_per_s=0.008, cycle_s=4.0)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from skinnode.config import SimulationConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
-from vcan_sim.scene import Scene
-from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.default_scene import Scene
+from vcan_sim.simulated_patch import SimulatedPatch
 
 LAYOUT = PatchLayout.preset("staggered")
 SCENE = Scene(LAYOUT, SimulationConfig(seed=5))

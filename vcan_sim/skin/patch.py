@@ -13,7 +13,7 @@ from vcan_sim.skin.body import Draws, made
 from vcan_sim.skin.crossbar import Side, floating_ohm, grounded_ohm
 from vcan_sim.skin.forward import ExactForward, Paths
 from vcan_sim.skin.front_end import FrontEnd
-from vcan_sim.skin.history import History
+from vcan_sim.skin.hysteresis_and_creep import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
@@ -21,7 +21,7 @@ ROW_STEP_S: Final = 1e-3
 
 Surface = Callable[[float], Float]
 """Function from time (s) to the positions (U, N, 3) of an exact patch's upper electrodes (m). At rest, it
-returns the array ``layout.upper_m`` itself. :meth:`vcan_sim.scene.Scene.upper_m` is such a function."""
+returns the array ``layout.upper_m`` itself. An example is :meth:`vcan_sim.default_scene.Scene.upper_m`."""
 
 
 class PhysicalPatch:

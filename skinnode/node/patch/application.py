@@ -17,8 +17,8 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import TOO_SLOW, EmcyCode
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node.application import ApplicationServices
-from skinnode.node.clock import NO_DEADLINE_NS, Pacing
 from skinnode.node.memory import Fault
+from skinnode.node.pacing import NO_DEADLINE_NS, Pacing
 from skinnode.node.patch.acquisition import Acquisition
 from skinnode.node.patch.objects import bind_baseline, bind_scan, describe, fields_of
 from skinnode.node.patch.scan_stream import OutgoingScan, ScanStream

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node.application import ApplicationServices
-from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.device import CanopenDevice
 from skinnode.node.memory import Memory
+from skinnode.node.pacing import THRIFTY, Pacing
 from skinnode.node.patch.acquisition import Acquisition
 from skinnode.node.patch.application import PatchApplication
 from skinnode.node.patch.source import ResistanceSource
@@ -32,8 +32,8 @@ class PatchNode(CanopenDevice):
         serial: serial number (0x1018:4 and 0x2000:11), u32.
         baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
             takes precedence.
-        pacing: :data:`~skinnode.node.clock.EXACT` for a node on its own board,
-            :data:`~skinnode.node.clock.THRIFTY` for many nodes on one computer.
+        pacing: :data:`~skinnode.node.pacing.EXACT` for a node on its own board,
+            :data:`~skinnode.node.pacing.THRIFTY` for many nodes on one computer.
         memory: non-volatile memory for the parameters, baseline and LSS configuration, or None.
         set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
 

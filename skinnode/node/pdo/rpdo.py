@@ -18,7 +18,7 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import Refused
 from skinnode.canopen.data_length import fd_length
 from skinnode.canopen.emergency import EmcyCode
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import PdoRecords
 from skinnode.node.rejected import Rejected
 from skinnode.node.services import NodeServices

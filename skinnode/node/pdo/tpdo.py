@@ -27,7 +27,7 @@ from collections.abc import Collection
 from typing import Protocol
 
 from skinnode.canopen import indices as od
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
 from skinnode.node.services import NodeServices
 from skinnode.node.sync import SyncWindow

@@ -12,8 +12,8 @@ from typing import Final
 
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.sdo import ABORT, SEGMENT_BYTES
-from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 

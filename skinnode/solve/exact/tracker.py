@@ -6,7 +6,7 @@ Each wire passes through these stages until one of them finds a root of F = b:
 - predict: move the electrodes by (∂x/∂R) ΔR, with the J⁻¹ of an earlier frame;
 - follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough (module ``follow``);
 - correct: iterate the operator to a tolerance far below any noise (module ``correct``);
-- widen: make a fixed electrode an unknown if it seems to move (module ``leave_out``);
+- widen: make a fixed electrode an unknown if it seems to move (module ``fixed_coordinates``);
 - recover: make further attempts if no root was found (module ``recover_lost_wires``).
 
 :mod:`skinnode.solve.roots` defines which roots are acceptable.
@@ -24,7 +24,7 @@ from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import as_statuses
 from skinnode.process.clock import perf_counter
-from skinnode.solve.exact.leave_out import LeftOut
+from skinnode.solve.exact.fixed_coordinates import LeftOut
 from skinnode.solve.exact.recover_lost_wires import recover_lost
 from skinnode.solve.exact.stream import FRAME_STEPS, Frame, StreamState
 from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask, checked_noise

@@ -36,7 +36,7 @@ from skinnode.solve.posterior.data_share import data_share
 from skinnode.solve.posterior.elastic_prior import LAYER_SHARE, ElasticPrior, bonded_response
 from skinnode.solve.posterior.gating import Fit, Gate
 from skinnode.solve.posterior.hyperparameters import Hyperparameters
-from skinnode.solve.posterior.local.disc_prior import DiscPrior
+from skinnode.solve.posterior.local.disc_search import DiscPrior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation, ObservationModel, Readings
 from skinnode.solve.wires.decode import A_MAX, A_MIN

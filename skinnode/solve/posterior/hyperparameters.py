@@ -15,7 +15,7 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.load_posterior import LoadPosterior
-from skinnode.solve.posterior.local.disc_prior import DiscPrior
+from skinnode.solve.posterior.local.disc_search import DiscPrior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 

@@ -12,7 +12,7 @@ from skinnode.config import SimulationConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.process import clock
 from skinnode.protocol.device_time import TIME_STEP_US
-from vcan_sim.scene import Scene
+from vcan_sim.default_scene import Scene
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
 
@@ -25,7 +25,7 @@ pair of wires reads inf, and a shorted pair reads 0."""
 
 
 class SkinMotion(Protocol):
-    """Skin motion of a patch, from :class:`vcan_sim.scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
+    """Skin motion, of a :class:`vcan_sim.default_scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
 
     @property
     def layout(self) -> PatchLayout:

@@ -249,6 +249,11 @@ class ScanAssembler:
         self._checked = True
 
     @property
+    def conflicts(self) -> int:
+        """Number of frames that contradict another frame of the same scan."""
+        return self._conflicts
+
+    @property
     def stats(self) -> AssemblerStats:
         """Snapshot of the counters."""
         is_open = self._counter != _NONE_OPEN

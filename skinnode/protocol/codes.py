@@ -126,7 +126,10 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         position = (resistance / baseline - scale.lo) / scale.step
         code = np.rint(position)
-        near_tie = np.abs(position - code) > 0.5 - scale.position_error
+        distance = np.abs(position - code)
+        if _all_measured(code, distance, resistance, baseline, scale):
+            return code.astype(np.uint32)
+        near_tie = distance > 0.5 - scale.position_error
         if near_tie.any():
             code = _round_exactly(code, near_tie, resistance, baseline, scale)
         measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
@@ -134,6 +137,31 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
         codes = np.where(resistance <= 0, scale.short, codes)
         codes = np.where(resistance < np.inf, codes, scale.open)  # false for NaN too
     return codes.astype(np.uint32)
+
+
+def _all_measured(
+    code: Float, distance: Float, resistance: Float, baseline: Float, scale: CodeScale
+) -> bool:
+    """Return whether all codes are measurements and none is near a tie, as in nearly every scan at rest.
+
+    Args:
+        code: rounded positions in the code range; any shape.
+        distance: distance of each position from its code, codes.
+        resistance: resistances, ohm; broadcastable to the shape of ``code``.
+        baseline: R0, ohm; broadcastable to the shape of ``code``.
+        scale: mapping of R/R0 to codes.
+    """
+    if not code.size:
+        return False
+    least, largest = np.minimum.reduce, np.maximum.reduce  # NaN makes every comparison below false
+    return bool(
+        largest(distance, axis=None) <= 0.5 - scale.position_error
+        and least(code, axis=None) >= 0.0
+        and largest(code, axis=None) <= scale.steps
+        and least(resistance, axis=None) > 0.0
+        and least(baseline, axis=None) > 0.0
+        and largest(baseline, axis=None) < np.inf
+    )
 
 
 def _round_exactly(

@@ -6,6 +6,7 @@ Frames that arrive while a queue is full are dropped and counted.
 from __future__ import annotations
 
 import contextlib
+import functools
 import queue
 import select
 import threading
@@ -25,7 +26,7 @@ frames/s)."""
 
 _POLL_S: Final = 0.02
 """Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
-
+_POLL_NS: Final = round(_POLL_S * 1e9)
 
 GATHER_NS: Final = 1_500_000
 """Pause (ns) between batches of frames. Without it, the receiving thread would wake up for every frame, up to
@@ -56,7 +57,8 @@ class Intake:
     While the queue is full, new frames are dropped and counted in :attr:`dropped`.
 
     Threads: only the reader thread may call :meth:`take` and :meth:`expect`. Any thread may call
-    :meth:`asked`. Only the receiving thread may call the other methods.
+    :meth:`asked`. Only the receiving thread may call the other methods. For a port that announces its frames,
+    the reader thread is also the receiving thread.
 
     Args:
         port: Port from which frames are received.
@@ -205,9 +207,9 @@ class _Shared:
 class Receiver:
     """Receives frames from several ports until :meth:`close` is called.
 
-    All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Each other port has
-    its own thread, because receiving with python-can may block. If a port fails, reception from the other
-    ports continues.
+    All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Ports that announce
+    their frames (timed) are read in :meth:`wait`, without a thread. Each other port has its own thread, because
+    receiving with python-can may block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill, one per port.
@@ -223,6 +225,7 @@ class Receiver:
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
+        self._signalled: dict[Intake, bool] = {}  # whether frames were announced
         if any(intake.port.pollable for intake in intakes):
             self._shared = clock.thread(target=self._receive_batches, name="receive")
             self._shared.start()
@@ -233,12 +236,19 @@ class Receiver:
         """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait."""
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
+        if self._signalled:
+            self._fetch_signalled()
 
     def resume(self, intake: Intake) -> None:
         """Resume reception from a port that has been reopened after a failure. Any thread may call this."""
         if intake.port.pollable:
             intake.resume()
             self._joining.append(intake)
+            return
+        if (signalling := intake.port.signalling) is not None:
+            intake.resume()
+            signalling.call_on_arrival(functools.partial(self._on_signal, intake))
+            self._on_signal(intake)  # frames may have arrived before
             return
         if intake in self._alone:
             # The error makes the old thread end, so it must not be cleared before.
@@ -264,6 +274,29 @@ class Receiver:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _on_signal(self, intake: Intake) -> None:
+        self._signalled[intake] = True
+        self._notify()
+
+    def _fetch_signalled(self) -> None:
+        """Fetch the announced frames, and note the time on ports without frames.
+
+        A port is also read if nothing was announced for :data:`_POLL_S`, so that its failure is found.
+        """
+        now_ns = clock.monotonic_ns()
+        for intake, announced in self._signalled.items():
+            if intake.failed or not (announced or now_ns - intake.seen_ns >= _POLL_NS):
+                continue
+            self._signalled[intake] = False
+            try:
+                if intake.fetch(0.0) and (port := intake.port.signalling) is not None:
+                    while not intake.failed and intake.fetch(0.0):
+                        pass
+                    intake.gather(now_ns)
+                    port.hold_until(intake.due_ns)
+            except Exception as error:
+                self._on_defect(error)
 
     def _receive_batches(self) -> None:
         shared = _Shared({}, select.poll())

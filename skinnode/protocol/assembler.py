@@ -397,7 +397,9 @@ class ScanAssembler:
             self._joined += 1
             self._discard(doubt=summary is None or flags & _BASELINE_CHANGED != 0)
             return None
-        self._held.update(self._frames[: self._n], carry=arrived and self._follows)
+        carry = arrived and self._follows
+        if self._received or not carry:
+            self._held.update(self._frames[: self._n], carry=carry)
         codes, valid, check = self._held.decode()
         verified = False
         if arrived and summary is not None and summary.check is not None and check is not None:

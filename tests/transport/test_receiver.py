@@ -28,6 +28,7 @@ class Script:
     """A port that plays frames and then an error, or silence."""
 
     reads_batches = pollable = False
+    signalling = None
 
     def __init__(self, count: int, error: Exception | None = None) -> None:
         self.config = BusConfig(name="script")

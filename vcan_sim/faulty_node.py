@@ -343,17 +343,17 @@ class FaultyNode(PatchNode):
 
     def _put(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
         """Put a frame on the bus unless the node is cut off, and return whether it was sent."""
-        kind = kind_of(can_id, data, remote)
+        kind, tally = kind_of(can_id, data, remote), self._injector.tally
         if self._is_cut_off:
             self.injected.silenced += 1
-            self.tally.silenced[kind] += 1
+            tally.silenced[kind] += 1
             return False
         try:
             self._emit(can_id, data, remote=remote)
         except BusError:
-            self.tally.refused[kind] += 1
+            tally.refused[kind] += 1
             raise
-        self.tally.emitted[kind] += 1
+        tally.emitted[kind] += 1
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
@@ -374,7 +374,7 @@ class FaultyNode(PatchNode):
     @property
     def _is_cut_off(self) -> bool:
         """Whether the node cannot send, being silent, unplugged or about to be reset."""
-        return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
+        return self._injector.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:

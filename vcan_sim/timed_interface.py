@@ -188,11 +188,12 @@ class Segment:
 
     def _deliver(self) -> None:
         self._due_ns = None
+        inboxes, listeners = self._inboxes, self.listeners
         for event in self.bus.advance(self.clock.now_ns):
             if isinstance(event, Delivered):
                 for station in event.receivers:
-                    self._inboxes[station].put(event)
-            for listener in self.listeners:
+                    inboxes[station].put(event)
+            for listener in listeners:
                 listener(event)
         if self._leaving:
             self._disconnect()

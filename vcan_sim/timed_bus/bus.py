@@ -110,7 +110,8 @@ class TimedBus:
             return False
         self._number += 1
         sender.queue.push(Waiting(arbitration_key(frame), self._number, time_ns, frame))
-        self._offer(sender)
+        if station not in self._pending:  # otherwise, it takes part in the next arbitration already
+            self._offer(sender)
         return True
 
     def clear(self, time_ns: int, station: int) -> None:

@@ -247,7 +247,7 @@ class NodeMonitor:
         return error_text(code, detail, ours=self.refusal is None)
 
     def _in_a_loop(self, now_ns: int) -> bool:
-        restarts = list(self._restarts)
+        restarts = list(self._restarts) if self._restarts else []
         if len(restarts) < LOOP_RESTARTS or now_ns - restarts[-1] > RESTART_MEMORY_NS:
             return False
         return restarts[-1] - restarts[0] < LOOP_NS

@@ -351,15 +351,16 @@ class TimedBus:
             return False
         waiting, start = flight.waiting[sender.index], flight.start
         free, end = start + course.free, start + course.end
-        ceil_ns, bit, queue = self._rates.ceil_ns, self._bit, sender.queue
+        rates, bit, queue = self._rates, self._bit, sender.queue
+        ceil_ns, events, frames = rates.ceil_ns, self._events, self._frames
         self._flight = self._start = self._next = None
         while end <= until:
             frame = waiting.frame
-            self._events.append(
+            events.append(
                 Delivered(ceil_ns(end), sender.index, frame, receivers, waiting.queued_ns, ceil_ns(start))
             )
             identifier = (frame.can_id, frame.extended)
-            self._frames[identifier] = self._frames.get(identifier, 0) + 1
+            frames[identifier] = frames.get(identifier, 0) + 1
             sender.sending, self._free = None, free
             if not pending:
                 return True
@@ -370,7 +371,7 @@ class TimedBus:
             sender.sending = waiting = queue.pop()
             if not len(queue):
                 pending.clear()
-            course = undisturbed(senders, waiting.frame, False, self._rates)
+            course = undisturbed(senders, waiting.frame, False, rates)
             free, end = start + course.free, start + course.end
             self._recessive_from = start + course.recessive
             self._occupancy.add(ceil_ns(start), ceil_ns(free))

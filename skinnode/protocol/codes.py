@@ -127,7 +127,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
         position = (resistance / baseline - scale.lo) / scale.step
         code = np.rint(position)
         distance = np.abs(position - code)
-        if _all_measured(code, distance, resistance, baseline, scale):
+        if _all_measured(code, distance, scale):
             return code.astype(np.uint32)
         near_tie = distance > 0.5 - scale.position_error
         if near_tie.any():
@@ -139,28 +139,23 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     return codes.astype(np.uint32)
 
 
-def _all_measured(
-    code: Float, distance: Float, resistance: Float, baseline: Float, scale: CodeScale
-) -> bool:
-    """Return whether all codes are measurements and none is near a tie, as in nearly every scan at rest.
+def _all_measured(code: Float, distance: Float, scale: CodeScale) -> bool:
+    """Return whether all codes are certainly measurements and none is near a tie, as in nearly every scan.
+
+    If the code range begins at least a step above 0, a ratio R/R0 inside the range implies that R and R0 are
+    positive and finite.
 
     Args:
         code: rounded positions in the code range; any shape.
         distance: distance of each position from its code, codes.
-        resistance: resistances, ohm; broadcastable to the shape of ``code``.
-        baseline: R0, ohm; broadcastable to the shape of ``code``.
         scale: mapping of R/R0 to codes.
     """
-    if not code.size:
+    if not code.size or scale.lo < scale.step:
         return False
-    least, largest = np.minimum.reduce, np.maximum.reduce  # NaN makes every comparison below false
-    return bool(
+    middle, largest = 0.5 * scale.steps, np.maximum.reduce
+    return bool(  # NaN makes both comparisons false
         largest(distance, axis=None) <= 0.5 - scale.position_error
-        and least(code, axis=None) >= 0.0
-        and largest(code, axis=None) <= scale.steps
-        and least(resistance, axis=None) > 0.0
-        and least(baseline, axis=None) > 0.0
-        and largest(baseline, axis=None) < np.inf
+        and largest(np.abs(code - middle), axis=None) <= middle
     )
 
 

@@ -69,6 +69,9 @@ class PatchApplication:
         self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
         self._operational = False
         self._counter = -1
+        # The codes that the receiver has, and the CRC over them. No code changes in place.
+        self._checked: Codes | None = None
+        self._check = 0
         self._period_ns = 0
         self._wire_faults = WireFaultReporter(profile, services.emcy)
         self.source = SourceMonitor(services.emcy, acquisition.selection.forget)
@@ -199,7 +202,9 @@ class PatchApplication:
             chunks, flags, codes = [], _SOURCE_FAILED, self._acquisition.codes
         check = None
         if profile.checked:
-            check = check_of_codes(codes, profile)
+            if codes is not self._checked:
+                self._checked, self._check = codes, check_of_codes(codes, profile)
+            check = self._check
             flags |= conversion_flags(self._acquisition.phase)
         self.stream.offer(OutgoingScan(counter, chunks, flags, time_us, check, turns), t_ns)
         if not self.stream.full:

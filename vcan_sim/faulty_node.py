@@ -301,10 +301,10 @@ class FaultyNode(PatchNode):
 
     def _out(self, can_id: int, data: bytes) -> None:
         if can_id == self._chunk_id:
-            self.tally.handed[Kind.CHUNK] += 1
+            self._injector.tally.handed[Kind.CHUNK] += 1
             self._faulty_scans.send_chunk(data)
         elif can_id == self._summary_id:
-            self.tally.handed[Kind.SUMMARY] += 1
+            self._injector.tally.handed[Kind.SUMMARY] += 1
             self._faulty_scans.send_summary(data)
         else:
             self._put_or_lose(can_id, self._imposture(can_id, data))

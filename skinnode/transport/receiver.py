@@ -225,19 +225,27 @@ class Receiver:
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
-        self._signalled: dict[Intake, bool] = {}  # whether frames were announced
+        self._signalled: dict[Intake, None] = {}
+        self._announced: deque[Intake] = deque()
+        self._swept_ns = 0  # time at which all signalled intakes were last fetched
+        self._fresh: deque[Intake] = deque()  # intakes with frames or an error since the last wait
         if any(intake.port.pollable for intake in intakes):
             self._shared = clock.thread(target=self._receive_batches, name="receive")
             self._shared.start()
         for intake in intakes:
             self.resume(intake)
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait."""
+    def wait(self, timeout_s: float) -> list[Intake]:
+        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait.
+
+        Returns:
+            Intakes that have received frames or an error since the last call.
+        """
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
         if self._signalled:
             self._fetch_signalled()
+        return _drained(self._fresh)
 
     def resume(self, intake: Intake) -> None:
         """Resume reception from a port that has been reopened after a failure. Any thread may call this."""
@@ -247,6 +255,7 @@ class Receiver:
             return
         if (signalling := intake.port.signalling) is not None:
             intake.resume()
+            self._signalled[intake] = None
             signalling.call_on_arrival(functools.partial(self._on_signal, intake))
             self._on_signal(intake)  # frames may have arrived before
             return
@@ -276,27 +285,36 @@ class Receiver:
         self.close()
 
     def _on_signal(self, intake: Intake) -> None:
-        self._signalled[intake] = True
+        self._announced.append(intake)
         self._notify()
 
     def _fetch_signalled(self) -> None:
-        """Fetch the announced frames, and note the time on ports without frames.
+        """Fetch the announced frames. Every :data:`_POLL_S`, fetch from all ports.
 
-        A port is also read if nothing was announced for :data:`_POLL_S`, so that its failure is found.
+        This finds the failure of a port, and notes the time on a port without frames.
         """
         now_ns = clock.monotonic_ns()
-        for intake, announced in self._signalled.items():
-            if intake.failed or not (announced or now_ns - intake.seen_ns >= _POLL_NS):
+        intakes = _drained(self._announced)
+        if now_ns - self._swept_ns >= _POLL_NS:
+            intakes, self._swept_ns = list(self._signalled), now_ns
+        for intake in intakes:
+            if intake.failed:
                 continue
-            self._signalled[intake] = False
             try:
-                if intake.fetch(0.0) and (port := intake.port.signalling) is not None:
-                    while not intake.failed and intake.fetch(0.0):
-                        pass
-                    intake.gather(now_ns)
-                    port.hold_until(intake.due_ns)
+                if intake.fetch(0.0):
+                    self._fresh.append(intake)
+                    self._gather_signalled(intake, now_ns)
             except Exception as error:
                 self._on_defect(error)
+
+    def _gather_signalled(self, intake: Intake, now_ns: int) -> None:
+        """Fetch the remaining frames, and have the port announce no more until the next fetch is due."""
+        while not intake.failed and intake.fetch(0.0):
+            pass
+        intake.gather(now_ns)
+        port = intake.port.signalling
+        if port is not None:
+            port.hold_until(intake.due_ns)
 
     def _receive_batches(self) -> None:
         shared = _Shared({}, select.poll())
@@ -331,6 +349,7 @@ class Receiver:
             for intake in failed:
                 del intakes[intake]
             shared.poll = _poll_of(intakes)
+        self._fresh.extend(fetched)
         self._notify()
         now_ns = clock.monotonic_ns()
         for intake in fetched:
@@ -345,6 +364,7 @@ class Receiver:
                     return
                 # After a time-out, fetch once more: frames may have arrived while the thread was suspended.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
+                    self._fresh.append(intake)
                     self._notify()
                     if intake.port.reads_batches:
                         now_ns = clock.monotonic_ns()
@@ -357,6 +377,14 @@ class Receiver:
     def _notify(self) -> None:
         if self._news.empty():  # one notification serves all intakes
             self._news.put(None)
+
+
+def _drained(intakes: deque[Intake]) -> list[Intake]:
+    """Remove all intakes from a queue, and return each of them once, in order."""
+    found: dict[Intake, None] = {}
+    while intakes:
+        found[intakes.popleft()] = None
+    return list(found)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:

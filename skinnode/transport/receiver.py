@@ -208,8 +208,8 @@ class Receiver:
     """Receives frames from several ports until :meth:`close` is called.
 
     All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Ports that announce
-    their frames (timed) are read in :meth:`wait`, without a thread. Each other port has its own thread, because
-    receiving with python-can may block. If a port fails, reception from the other ports continues.
+    their frames (timed) are read in :meth:`wait`, without a thread. Each other port has its own thread,
+    because receiving with python-can may block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill, one per port.

@@ -52,6 +52,8 @@ class FaultyConverter:
         self._reading: Float | None = None
         self._conversions: int | None = None
         self._held: dict[tuple[str, object], Float] = {}  # readings from the start of each fault
+        self._examined: Faults | None = None
+        self._wires_intact = True
 
     @property
     def conversions(self) -> int | None:
@@ -87,7 +89,10 @@ class FaultyConverter:
 
     def _through_wires(self, read: Float) -> Float:
         faults = self._injector.faults
-        if all(getattr(faults, name) is None for name in OF_WIRES) or self._booting():
+        if faults is not self._examined:
+            self._examined = faults
+            self._wires_intact = all(getattr(faults, name) is None for name in OF_WIRES)
+        if self._wires_intact or self._booting():
             self._held = {}
             return read
         self._injector.injected.miswired += 1

@@ -301,10 +301,10 @@ class FaultyNode(PatchNode):
 
     def _out(self, can_id: int, data: bytes) -> None:
         if can_id == self._chunk_id:
-            self.tally.handed[Kind.CHUNK] += 1
+            self._injector.tally.handed[Kind.CHUNK] += 1
             self._faulty_scans.send_chunk(data)
         elif can_id == self._summary_id:
-            self.tally.handed[Kind.SUMMARY] += 1
+            self._injector.tally.handed[Kind.SUMMARY] += 1
             self._faulty_scans.send_summary(data)
         else:
             self._put_or_lose(can_id, self._imposture(can_id, data))
@@ -343,17 +343,17 @@ class FaultyNode(PatchNode):
 
     def _put(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
         """Put a frame on the bus unless the node is cut off, and return whether it was sent."""
-        kind = kind_of(can_id, data, remote)
+        kind, tally = kind_of(can_id, data, remote), self._injector.tally
         if self._is_cut_off:
             self.injected.silenced += 1
-            self.tally.silenced[kind] += 1
+            tally.silenced[kind] += 1
             return False
         try:
             self._emit(can_id, data, remote=remote)
         except BusError:
-            self.tally.refused[kind] += 1
+            tally.refused[kind] += 1
             raise
-        self.tally.emitted[kind] += 1
+        tally.emitted[kind] += 1
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
@@ -374,7 +374,7 @@ class FaultyNode(PatchNode):
     @property
     def _is_cut_off(self) -> bool:
         """Whether the node cannot send, being silent, unplugged or about to be reset."""
-        return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
+        return self._injector.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:

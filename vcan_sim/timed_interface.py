@@ -48,6 +48,8 @@ class Inbox:
     def __init__(self, clock: VirtualClock) -> None:
         self._clock, self._queue = clock, Mailbox(clock)
         self._quiet_until_ns, self._due = 0, False
+        self.on_arrival: Callable[[], object] = lambda: None
+        """Function called when the reader is woken."""
 
     @property
     def quiet_until_ns(self) -> int:
@@ -79,9 +81,14 @@ class Inbox:
         frames += [waiting.popleft() for _ in range(min(len(waiting), most - 1))]
         return frames
 
+    def hold_until(self, t_ns: int) -> None:
+        """Do not wake the reader before ``t_ns``."""
+        self._quiet_until_ns = max(self._quiet_until_ns, t_ns)
+
     def _wake(self) -> None:
         self._due, self._quiet_until_ns = False, self._clock.now_ns + COALESCED_NS
         self._queue.wake()
+        self.on_arrival()
 
 
 class Segment:
@@ -181,11 +188,12 @@ class Segment:
 
     def _deliver(self) -> None:
         self._due_ns = None
+        inboxes, listeners = self._inboxes, self.listeners
         for event in self.bus.advance(self.clock.now_ns):
             if isinstance(event, Delivered):
                 for station in event.receivers:
-                    self._inboxes[station].put(event)
-            for listener in self.listeners:
+                    inboxes[station].put(event)
+            for listener in listeners:
                 listener(event)
         if self._leaving:
             self._disconnect()
@@ -318,6 +326,14 @@ class TimedInterface(can.BusABC):
             for event in self._inbox.get_all(timeout_s, most)
             for sent in (event.frame,)
         ]
+
+    def call_on_arrival(self, function: Callable[[], object]) -> None:
+        """Call ``function`` whenever :class:`Inbox` wakes the reader."""
+        self._inbox.on_arrival = function
+
+    def hold_until(self, t_ns: int) -> None:
+        """Announce no frames before ``t_ns``."""
+        self._inbox.hold_until(t_ns)
 
     def _check_open(self) -> None:
         if self._is_shutdown:

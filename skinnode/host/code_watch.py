@@ -110,7 +110,8 @@ class CodeWatch:
     @property
     def wires(self) -> tuple[WireFault, ...]:
         """Wires that are currently open, shorted, noisy or drifting."""
-        return tuple(sorted({*self._broken, *self._windows.wires}))
+        broken, unsteady = self._broken, self._windows.wires
+        return tuple(sorted({*broken, *unsteady})) if broken or unsteady else ()
 
     def judge(self, scan: Scan, number: int | None = None) -> Verdict:
         """Check the codes of the next scan before it is solved.

@@ -45,6 +45,7 @@ from skinnode.protocol.summary import SummaryFlag
 from skinnode.text.words import counted
 
 _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
+_CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 
 FALSE_ALARM: Final = 1e-12
 """False alarm probability of each test for a frozen crossing, wire or patch. A patch of 10 × 30 wires has 341
@@ -186,8 +187,8 @@ class ConverterLiveness:
             self._end_run(returned, largest)
         # codes missing from the previous scan may count as changed
         self._compare_phase(scan, unchanged=measured > 0 and changed <= self._missing)
-        self._missing = 0 if scan.flags & SummaryFlag.CHANGED_ONLY else scan.codes.size - measured
-        if changed or not measured or scan.flags & SummaryFlag.CHANGED_ONLY:
+        self._missing = 0 if scan.flags & _CHANGED_ONLY else scan.codes.size - measured
+        if changed or not measured or scan.flags & _CHANGED_ONLY:
             return
         self._run += 1
         self._codes += measured

@@ -236,4 +236,7 @@ def condition_of(facts: Evidence) -> Condition:
         (stale, Condition.STALE),
         (facts.frozen, Condition.FROZEN),
     )
-    return next((condition for holds, condition in rules if holds), Condition.OPERATIONAL)
+    for holds, condition in rules:
+        if holds:
+            return condition
+    return Condition.OPERATIONAL

@@ -162,12 +162,17 @@ class HealthWatch:
             self._publish(name, "restarts in a loop", "restarts in a loop: check its supply and watchdog")
         if now.duplicate_id and not before.duplicate_id:
             self._publish(name, "duplicate node-ID", f"two nodes have node-ID {now.node_id}")
+        if now.wires != before.wires:
+            self._compare_wires(name, before, now)
+        if now.faults != before.faults:
+            self._compare_frozen_parts(name, before, now)
+        self._compare_counters(name, before, now, _PATCH_COUNTERS)
+
+    def _compare_wires(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
         for fault in sorted({*now.wires} - {*before.wires}):
             self._publish(name, fault.state.value, f"{fault.side} wire {fault.number} is {fault.state}")
         for fault in sorted({*before.wires} - {*now.wires}):
             self._publish(name, "well", f"{fault.side} wire {fault.number} is no longer {fault.state}")
-        self._compare_frozen_parts(name, before, now)
-        self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
         """Publish an event when a frozen wire or crossing is left out of the solve or used again."""
@@ -184,21 +189,22 @@ class HealthWatch:
         self, name: str, before: object, now: object, counters: Mapping[str, tuple[str, str]]
     ) -> None:
         for counter, words in counters.items():
+            count = getattr(now, counter)
+            if not count:  # most counters of a healthy hand
+                continue
             detail = ""
             if isinstance(now, BusHealth) and counter == "foreign":
                 detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
             elif isinstance(now, PatchHealth) and counter == "emergencies":
                 detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
-            counts = (getattr(before, counter), getattr(now, counter))
-            self._compare_count(name, counter, counts, words, detail)
+            self._compare_count(name, counter, (getattr(before, counter), count), words, detail)
 
     def _compare_count(
         self, name: str, counter: str, counts: tuple[int, int], words: tuple[str, str], detail: str
     ) -> None:
         before, count = counts
         when_ns, reported = self._reported.get((name, counter), (0, before))
-        t_ns = self._now_ns()
-        if count > reported and t_ns - when_ns > _QUIET_NS:
+        if count > reported and (t_ns := self._now_ns()) - when_ns > _QUIET_NS:
             self._reported[name, counter] = t_ns, count
             self._publish(name, counter, f"{counted(count - reported, *words)}{detail}")
 

@@ -262,10 +262,11 @@ class Host:
             clock.monotonic_ns(),
             node.heartbeat_s,
             self.hand.sync.period_s,
-            node.stream.stats().assembler.conflicts,
+            node.stream.conflicts,
             node.stream.t_passed_ns,
         )
-        return replace(health, faults=faults_of(self._publisher.latest(patch)))
+        faults = faults_of(self._publisher.latest(patch))
+        return replace(health, faults=faults) if faults else health
 
     def bus_health(self, bus: str) -> BusHealth:
         """Return the health of a bus.

@@ -15,6 +15,8 @@ from skinnode.transport import Receiver
 
 _WAIT_S: Final = 0.02
 """Maximum wait (s) for a frame before the pollers are called."""
+_ROUND_NS: Final = 10_000_000
+"""Maximum interval (ns) between iterations that serve all buses, also those without new frames."""
 
 
 class Mainline:
@@ -33,6 +35,8 @@ class Mainline:
     def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:
         self._links = tuple(links)
         self._defects = links[0].defects if defects is None else defects
+        self._by_intake = {link.intake: link for link in links}
+        self._round_ns = 0  # time from which the next iteration serves all buses
         self._measured = itertools.cycle(self._links)
         self._stop = clock.event()
         self._receiver = Receiver(
@@ -68,8 +72,14 @@ class Mainline:
     def _turn(self) -> bool:
         if self._stop.is_set():
             return False
-        self._receiver.wait(_WAIT_S)
-        for link in self._links:
+        heard = self._receiver.wait(_WAIT_S)
+        now_ns = clock.monotonic_ns()
+        links: Sequence[BusLink] = self._links
+        if now_ns < self._round_ns:  # with many buses, most have received nothing
+            links = [self._by_intake[intake] for intake in heard]
+        else:
+            self._round_ns = now_ns + _ROUND_NS
+        for link in links:
             try:
                 link.turn()
             except Exception as error:

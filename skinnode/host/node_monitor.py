@@ -254,7 +254,10 @@ class NodeMonitor:
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
         """Return whether heartbeats arrive too often for a single node."""
-        beats, period_ns = list(self._beats), heartbeat_s * 1e9
-        if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
+        beats, period_ns = self._beats, heartbeat_s * 1e9
+        if len(beats) < BEATS:
             return False
-        return beats[-1] - beats[0] < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns
+        first_ns, last_ns = beats[0], beats[-1]  # never fewer, even if the mainline appends one meanwhile
+        if now_ns - last_ns > HEARTBEATS_MISSED * period_ns:
+            return False
+        return last_ns - first_ns < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns

@@ -204,6 +204,11 @@ class PatchStream:
         return self.withholdings
 
     @property
+    def conflicts(self) -> int:
+        """Number of frames that contradict another frame of the same scan."""
+        return self._assembler.conflicts
+
+    @property
     def withholding(self) -> bool:
         """Whether scans are being withheld."""
         return self._solver is None

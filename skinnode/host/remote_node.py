@@ -69,6 +69,7 @@ class RemoteNode:
         self._answers = 0
         """Number of SDO responses received with this node-ID."""
         self._hand, self._lss = hand, bus.lss
+        self._mute_ns = max(_MUTE_S, _MUTE_SCANS * hand.sync.period_s) * 1e9
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
 
@@ -196,8 +197,7 @@ class RemoteNode:
             since_ns: Monotonic time (ns) at which the node became operational.
         """
         scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
-        patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
-        return not self.has_other_master and self.link.t_dispatched_ns > scan_ns + patience_ns
+        return not self.has_other_master and self.link.t_dispatched_ns > scan_ns + self._mute_ns
 
     def is_configured(self) -> bool:
         """Return the result of :func:`~skinnode.host.configurator.is_configured` for the node."""

@@ -95,6 +95,8 @@ class EmcyProducer:
 
     def on_timer(self, t_ns: int) -> None:
         """Send queued messages as the inhibit time allows. A message that the bus refuses stays queued."""
+        if not self._waiting:
+            return
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
             if self._lost:  # the dropped messages were the oldest

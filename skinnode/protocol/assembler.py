@@ -249,6 +249,11 @@ class ScanAssembler:
         self._checked = True
 
     @property
+    def conflicts(self) -> int:
+        """Number of frames that contradict another frame of the same scan."""
+        return self._conflicts
+
+    @property
     def stats(self) -> AssemblerStats:
         """Snapshot of the counters."""
         is_open = self._counter != _NONE_OPEN
@@ -392,7 +397,9 @@ class ScanAssembler:
             self._joined += 1
             self._discard(doubt=summary is None or flags & _BASELINE_CHANGED != 0)
             return None
-        self._held.update(self._frames[: self._n], carry=arrived and self._follows)
+        carry = arrived and self._follows
+        if self._received or not carry:
+            self._held.update(self._frames[: self._n], carry=carry)
         codes, valid, check = self._held.decode()
         verified = False
         if arrived and summary is not None and summary.check is not None and check is not None:

@@ -83,15 +83,15 @@ def pack_scan(
         only: chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
 
     Raises:
-        ValueError: if the shape is wrong, or if a code has more bits than ``profile`` allows.
+        ValueError: if the shape is wrong, or if a code to pack has more bits than ``profile`` allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
         raise ValueError(f"codes: got shape {array.shape}, must be ({profile.rows}, {profile.columns})")
-    if int(array.max()) >> profile.code_bits:
-        raise ValueError(f"codes: got {int(array.max())}, must be below {1 << profile.code_bits}")
     if only is not None and not len(only):
         return []
+    if int(array.max()) >> profile.code_bits:
+        raise ValueError(f"codes: got {int(array.max())}, must be below {1 << profile.code_bits}")
     width, per, size, n = (
         profile.code_bits // 8,
         profile.codes_per_chunk,

@@ -126,7 +126,10 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         position = (resistance / baseline - scale.lo) / scale.step
         code = np.rint(position)
-        near_tie = np.abs(position - code) > 0.5 - scale.position_error
+        distance = np.abs(position - code)
+        if _all_measured(code, distance, scale):
+            return code.astype(np.uint32)
+        near_tie = distance > 0.5 - scale.position_error
         if near_tie.any():
             code = _round_exactly(code, near_tie, resistance, baseline, scale)
         measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
@@ -134,6 +137,26 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
         codes = np.where(resistance <= 0, scale.short, codes)
         codes = np.where(resistance < np.inf, codes, scale.open)  # false for NaN too
     return codes.astype(np.uint32)
+
+
+def _all_measured(code: Float, distance: Float, scale: CodeScale) -> bool:
+    """Return whether all codes are certainly measurements and none is near a tie, as in nearly every scan.
+
+    If the code range begins at least a step above 0, a ratio R/R0 inside the range implies that R and R0 are
+    positive and finite.
+
+    Args:
+        code: rounded positions in the code range; any shape.
+        distance: distance of each position from its code, codes.
+        scale: mapping of R/R0 to codes.
+    """
+    if not code.size or scale.lo < scale.step:
+        return False
+    middle, largest = 0.5 * scale.steps, np.maximum.reduce
+    return bool(  # NaN makes both comparisons false
+        largest(distance, axis=None) <= 0.5 - scale.position_error
+        and largest(np.abs(code - middle), axis=None) <= middle
+    )
 
 
 def _round_exactly(

@@ -23,11 +23,12 @@ class HeldChunks:
         self._profile = profile
         self._steps = (1 << profile.code_bits) - 4
         self._payloads: Sequence[bytes | None] = []
+        self._decoded: tuple[Codes, NDArray[np.bool_], int | None] | None = None
         self.forget()
 
     def forget(self) -> None:
         """Discard all payloads, because a scan that may have changed them was lost."""
-        self._payloads = [None] * self._profile.n_chunks
+        self._payloads, self._decoded = [None] * self._profile.n_chunks, None
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
         """Store the payloads of a closed scan.
@@ -39,16 +40,21 @@ class HeldChunks:
         if carry and None in received:
             held = self._payloads
             received = [old if new is None else new for new, old in zip(received, held, strict=True)]
-        self._payloads = received
+        self._payloads, self._decoded = received, None
 
     def decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
-        """Decode all stored payloads.
+        """Decode all stored payloads. Until they change, every call returns the same read-only arrays.
 
         Returns:
             (U, K) codes, with :data:`~skinnode.protocol.codes.MISSING` where unknown; a (U, K) mask of the
             measurements; and the CRC over the codes
             (:func:`~skinnode.protocol.scan_check.check_of_codes`), or None if any code is unknown.
         """
+        if self._decoded is None:
+            self._decoded = self._decode()
+        return self._decoded
+
+    def _decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
         profile = self._profile
         known = [payload for payload in self._payloads if payload is not None]
         blank = bytes(profile.chunk_bytes)

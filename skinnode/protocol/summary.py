@@ -71,9 +71,9 @@ def conversion_phase(flags: int) -> int:
     return flags >> PHASE_SHIFT & 3
 
 
-def conversion_flags(phase: int) -> SummaryFlag:
+def conversion_flags(phase: int) -> int:
     """Return the summary flags that encode a conversion phase, 0 to 3."""
-    return SummaryFlag(phase << PHASE_SHIFT)
+    return phase << PHASE_SHIFT
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:

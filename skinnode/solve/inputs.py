@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -44,6 +45,39 @@ class CodeMap:
         return np.where(valid, ohm, np.nan), valid
 
 
+class CodeDecoder:
+    """Decoder of the codes of a stream. Codes that have not changed are not decoded again.
+
+    Args:
+        meaning: Mapping of the codes to resistances.
+    """
+
+    def __init__(self, meaning: CodeMap) -> None:
+        self._meaning = meaning
+        self._codes: NDArray[np.uint32] | None = None
+        self._decoded: tuple[Float, NDArray[np.bool_], int]
+
+    def decode(self, codes: NDArray[np.uint32]) -> tuple[Float, NDArray[np.bool_], int]:
+        """Decode the codes of a frame.
+
+        Args:
+            codes: (U, K) codes. If a host passes the read-only array of the last frame again, because the
+                node has sent no other codes, the result is that of the last call.
+
+        Returns:
+            Read-only resistances (U, K), ohm, NaN where a code is invalid; a read-only mask (U, K) of the
+            valid codes; and the number of invalid codes.
+        """
+        if codes is self._codes:
+            return self._decoded
+        ohm, valid = self._meaning.decode(codes)
+        ohm.flags.writeable = valid.flags.writeable = False
+        self._decoded = ohm, valid, valid.size - int(np.count_nonzero(valid))
+        constant = codes.flags.owndata and not codes.flags.writeable
+        self._codes = codes if constant else None
+        return self._decoded
+
+
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     """Return the relative noise as an array (U, K).
 
@@ -52,11 +86,19 @@ def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     """
     if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
         return np.asarray(relative_noise, np.float64)  # fast path: hosts pass an array with every frame
+    if isinstance(relative_noise, float):
+        return _uniform(relative_noise, layout.shape)
     try:
         return np.asarray(np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape))
     except (TypeError, ValueError) as error:
         got = f"got shape {np.shape(relative_noise)}" if np.ndim(relative_noise) else f"{error}"
         raise ValueError(f"relative_noise: {got}, must be a number or {layout.shape}") from None
+
+
+@functools.lru_cache(maxsize=64)
+def _uniform(value: float, shape: tuple[int, int]) -> Float:
+    """Return a read-only array (U, K) with the same value everywhere."""
+    return np.broadcast_to(np.float64(value), shape)
 
 
 def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:

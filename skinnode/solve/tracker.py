@@ -30,7 +30,7 @@ from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.detect.rest_gate import RestGate
 from skinnode.solve.exact.contacts import ExactContacts
 from skinnode.solve.exact.tracker import ExactTracker
-from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask
+from skinnode.solve.inputs import CodeDecoder, CodeMap, broadcast_noise, checked_codes, checked_mask
 from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
@@ -81,6 +81,7 @@ class Tracker:
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
         self._rest = RestGate(layout, options) if options.detect else None
+        self._decoder = None if options.codes is None else CodeDecoder(options.codes)
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
@@ -192,10 +193,11 @@ class Tracker:
         if meaning is None:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
         if self._rest is not None:
-            ohm, valid = meaning.decode(checked_codes(codes, self.layout))
-            rest = self._at_rest(ohm, valid, None, meaning)
+            assert self._decoder is not None  # the option ``codes`` is set
+            ohm, valid, invalid = self._decoder.decode(checked_codes(codes, self.layout))
+            rest = self._at_rest(ohm, valid if invalid else None, None, meaning)
             if rest is not None:
-                return rest, valid.size - int(np.count_nonzero(valid))
+                return rest, invalid
         if self._exact is None or self.method == "posterior":
             ohm, valid = meaning.decode(checked_codes(codes, self.layout))
             noise, rounding_ohm = meaning.relative_noise, meaning.rounding_ohm

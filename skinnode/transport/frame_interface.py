@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from skinnode.transport.frame import Frame
@@ -33,4 +34,23 @@ class FrameInterface(Protocol):
         Raises:
             can.CanError, OSError or ValueError: if the interface is closed.
         """
+        ...
+
+
+@runtime_checkable
+class SignallingInterface(FrameInterface, Protocol):
+    """Interface that announces frames by a call, so that no thread has to wait for them.
+
+    On a simulated bus in virtual time, waking a thread for each batch of frames would take longer than
+    receiving them.
+    """
+
+    def call_on_arrival(self, function: Callable[[], object]) -> None:
+        """Call ``function`` from now on when frames have arrived. It must not wait.
+
+        A frame that arrives before the time given to :meth:`hold_until` is announced at that time.
+        """
+
+    def hold_until(self, t_ns: int) -> None:
+        """Announce no frames before monotonic time ``t_ns``, so that they are fetched together."""
         ...

@@ -21,7 +21,7 @@ from skinnode.process import clock
 from skinnode.process.closing import Closing
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
-from skinnode.transport.frame_interface import FrameInterface
+from skinnode.transport.frame_interface import FrameInterface, SignallingInterface
 from skinnode.transport.multicast import MulticastSocket, limit_to_group, new_tag
 from skinnode.transport.socket_options import enlarge_receive_buffer, socket_of
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
@@ -165,6 +165,7 @@ class CanPort(Closing):
         )
         self._socket = self._multicast or self._reader
         self._direct: FrameInterface | None = self._multicast or _direct(self._bus)
+        self._signalling = self._direct if isinstance(self._direct, SignallingInterface) else None
         self._shutdown = (self._multicast or self._bus).shutdown
 
     def _open(self) -> can.BusABC:
@@ -179,6 +180,14 @@ class CanPort(Closing):
     def reads_batches(self) -> bool:
         """Whether :meth:`recv_batch` may return more than one frame."""
         return self._reader is not None or self._direct is not None
+
+    @property
+    def signalling(self) -> SignallingInterface | None:
+        """Interface that announces arriving frames by a call; None if a thread has to wait for them.
+
+        After :meth:`reopen`, it is another object.
+        """
+        return self._signalling
 
     @property
     def pollable(self) -> bool:

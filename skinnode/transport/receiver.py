@@ -6,6 +6,7 @@ Frames that arrive while a queue is full are dropped and counted.
 from __future__ import annotations
 
 import contextlib
+import functools
 import queue
 import select
 import threading
@@ -25,7 +26,7 @@ frames/s)."""
 
 _POLL_S: Final = 0.02
 """Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
-
+_POLL_NS: Final = round(_POLL_S * 1e9)
 
 GATHER_NS: Final = 1_500_000
 """Pause (ns) between batches of frames. Without it, the receiving thread would wake up for every frame, up to
@@ -56,7 +57,8 @@ class Intake:
     While the queue is full, new frames are dropped and counted in :attr:`dropped`.
 
     Threads: only the reader thread may call :meth:`take` and :meth:`expect`. Any thread may call
-    :meth:`asked`. Only the receiving thread may call the other methods.
+    :meth:`asked`. Only the receiving thread may call the other methods. For a port that announces its frames,
+    the reader thread is also the receiving thread.
 
     Args:
         port: Port from which frames are received.
@@ -205,9 +207,9 @@ class _Shared:
 class Receiver(Closing):
     """Receives frames from several ports until :meth:`close` is called.
 
-    All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Each other port has
-    its own thread, because receiving with python-can may block. If a port fails, reception from the other
-    ports continues.
+    All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Ports that announce
+    their frames (timed) are read in :meth:`wait`, without a thread. Each other port has its own thread,
+    because receiving with python-can may block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill, one per port.
@@ -223,22 +225,39 @@ class Receiver(Closing):
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
+        self._signalled: dict[Intake, None] = {}
+        self._announced: deque[Intake] = deque()
+        self._swept_ns = 0  # time at which all signalled intakes were last fetched
+        self._fresh: deque[Intake] = deque()  # intakes with frames or an error since the last wait
         if any(intake.port.pollable for intake in intakes):
             self._shared = clock.thread(target=self._receive_batches, name="receive")
             self._shared.start()
         for intake in intakes:
             self.resume(intake)
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait."""
+    def wait(self, timeout_s: float) -> list[Intake]:
+        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait.
+
+        Returns:
+            Intakes that have received frames or an error since the last call.
+        """
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
+        if self._signalled:
+            self._fetch_signalled()
+        return _drained(self._fresh)
 
     def resume(self, intake: Intake) -> None:
         """Resume reception from a port that has been reopened after a failure. Any thread may call this."""
         if intake.port.pollable:
             intake.resume()
             self._joining.append(intake)
+            return
+        if (signalling := intake.port.signalling) is not None:
+            intake.resume()
+            self._signalled[intake] = None
+            signalling.call_on_arrival(functools.partial(self._on_signal, intake))
+            self._on_signal(intake)  # frames may have arrived before
             return
         if intake in self._alone:
             # The error makes the old thread end, so it must not be cleared before.
@@ -256,6 +275,38 @@ class Receiver(Closing):
             thread.join()
         if self._shared is not None:
             self._shared.join()
+
+    def _on_signal(self, intake: Intake) -> None:
+        self._announced.append(intake)
+        self._notify()
+
+    def _fetch_signalled(self) -> None:
+        """Fetch the announced frames. Every :data:`_POLL_S`, fetch from all ports.
+
+        This finds the failure of a port, and notes the time on a port without frames.
+        """
+        now_ns = clock.monotonic_ns()
+        intakes = _drained(self._announced)
+        if now_ns - self._swept_ns >= _POLL_NS:
+            intakes, self._swept_ns = list(self._signalled), now_ns
+        for intake in intakes:
+            if intake.failed:
+                continue
+            try:
+                if intake.fetch(0.0):
+                    self._fresh.append(intake)
+                    self._gather_signalled(intake, now_ns)
+            except Exception as error:
+                self._on_defect(error)
+
+    def _gather_signalled(self, intake: Intake, now_ns: int) -> None:
+        """Fetch the remaining frames, and have the port announce no more until the next fetch is due."""
+        while not intake.failed and intake.fetch(0.0):
+            pass
+        intake.gather(now_ns)
+        port = intake.port.signalling
+        if port is not None:
+            port.hold_until(intake.due_ns)
 
     def _receive_batches(self) -> None:
         shared = _Shared({}, select.poll())
@@ -290,6 +341,7 @@ class Receiver(Closing):
             for intake in failed:
                 del intakes[intake]
             shared.poll = _poll_of(intakes)
+        self._fresh.extend(fetched)
         self._notify()
         now_ns = clock.monotonic_ns()
         for intake in fetched:
@@ -304,6 +356,7 @@ class Receiver(Closing):
                     return
                 # After a time-out, fetch once more: frames may have arrived while the thread was suspended.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
+                    self._fresh.append(intake)
                     self._notify()
                     if intake.port.reads_batches:
                         now_ns = clock.monotonic_ns()
@@ -316,6 +369,14 @@ class Receiver(Closing):
     def _notify(self) -> None:
         if self._news.empty():  # one notification serves all intakes
             self._news.put(None)
+
+
+def _drained(intakes: deque[Intake]) -> list[Intake]:
+    """Remove all intakes from a queue, and return each of them once, in order."""
+    found: dict[Intake, None] = {}
+    while intakes:
+        found[intakes.popleft()] = None
+    return list(found)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:

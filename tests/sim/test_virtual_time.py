@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import queue
+import signal
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future
+from types import FrameType
 
 import can
 import pytest
@@ -252,3 +256,67 @@ def test_without_a_virtual_clock_an_event_loop_is_that_of_asyncio() -> None:
         return type(asyncio.get_running_loop())
 
     assert run(main()) is asyncio.run(main())
+
+
+class Interrupted(Exception):
+    """Raised by a signal handler."""
+
+
+@pytest.fixture
+def raising_signal() -> Iterator[signal.Signals]:
+    """Return a signal whose handler raises Interrupted."""
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        raise Interrupted
+
+    before = signal.signal(signal.SIGUSR1, handle)
+    yield signal.SIGUSR1
+    signal.signal(signal.SIGUSR1, before)
+
+
+def test_an_exception_of_a_signal_handler_waits_for_its_turn(raising_signal: signal.Signals) -> None:
+    """The first thread must not run beside the thread that has the turn, nor make a thread miss its time."""
+    main, items, running, ended = threading.get_ident(), 200, [False], [False]
+    with VirtualClock():
+        queue_of_main, late_ns = clock.queue(), list[int]()
+
+        def interrupt() -> None:
+            while not ended[0]:
+                clock.sleep(0.003)
+                running[0] = True
+                signal.pthread_kill(main, raising_signal)
+                end_s = time.monotonic() + 0.001
+                while time.monotonic() < end_s:  # lets the first thread run the handler
+                    time.sleep(1e-4)
+                running[0] = False
+
+        def nap() -> None:
+            while not ended[0]:
+                due_ns = clock.monotonic_ns() + 7_000_000
+                clock.sleep(0.007)
+                late_ns.append(clock.monotonic_ns() - due_ns)
+                queue_of_main.put(None)
+
+        threads = [clock.thread(interrupt, "interrupt"), *(clock.thread(nap, f"nap {i}") for i in range(3))]
+        for thread in threads:
+            thread.start()
+        interrupted = taken = 0
+        while taken < items:
+            try:
+                queue_of_main.get()
+                taken += 1
+            except Interrupted:
+                interrupted += 1
+            assert not running[0]
+            try:
+                clock.sleep(0.001)
+            except Interrupted:
+                interrupted += 1
+            assert not running[0]
+        ended[0] = True
+        for thread in threads:
+            while thread.is_alive():
+                with contextlib.suppress(Interrupted):
+                    thread.join()
+    assert interrupted > items // 2
+    assert set(late_ns) == {0}

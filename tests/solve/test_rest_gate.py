@@ -137,6 +137,22 @@ def test_codes_at_rest_are_no_touch_and_a_press_is(own: float) -> None:
     assert not any([update(REST).touched for _ in range(60)][10:])
 
 
+def test_codes_that_change_in_place_are_decoded_again() -> None:
+    """A host passes the same array again if no code has changed; any other program may reuse its array."""
+    own, scale, rng = 1e-3, CodeScale(16), np.random.default_rng(8)
+    codes = CodeMap(REST, scale.lo, scale.step, scale.steps, scale.relative_std * REST, own)
+    reusing, fresh = tracker(own, codes=codes), tracker(own, codes=codes)
+    array = np.zeros(REST.shape, np.uint32)
+    frozen = array.view()
+    frozen.flags.writeable = False
+    for number in range(40):
+        array[:] = encode(REST * (1.0 + own * rng.standard_normal(REST.shape)), REST, scale)
+        passed = array if number % 2 else frozen
+        one, other = reusing.update_codes(passed)[0], fresh.update_codes(array.copy())[0]
+        np.testing.assert_array_equal(one.residual, other.residual)
+        assert one.touch_odds == other.touch_odds
+
+
 def test_options_of_the_detector_are_checked() -> None:
     for name in ("false_alarms_per_hour", "scan_period_s"):
         with pytest.raises(ValueError, match=name):

@@ -12,9 +12,11 @@ import pytest
 
 from skinnode.config import BusConfig
 from skinnode.errors import BusError
+from skinnode.process import clock
 from skinnode.transport import CanPort, Frame, Intake, Receiver
 from skinnode.transport.datagram import DatagramPort, datagram, free_channel
 from skinnode.transport.receiver import GATHER_NS, LONG_NS
+from vcan_sim.virtual_time import VirtualClock
 
 
 @pytest.fixture(autouse=True)
@@ -28,6 +30,7 @@ class Script:
     """A port that plays frames and then an error, or silence."""
 
     reads_batches = pollable = False
+    signalling = None
 
     def __init__(self, count: int, error: Exception | None = None) -> None:
         self.config = BusConfig(name="script")
@@ -151,6 +154,32 @@ def test_many_buses_wake_one_thread() -> None:
     ):
         names = sorted(thread.name for thread in set(threading.enumerate()) - before)
     assert names == ["receive", "receive can7"]  # python-can may block in the other
+
+
+def test_buses_in_virtual_time_need_no_thread_and_a_failure_is_found_without_frames() -> None:
+    with VirtualClock(), ExitStack() as opened:
+        configs = [BusConfig(name=name, interface="timed", channel=name) for name in ("can0", "can1")]
+        senders = [opened.enter_context(CanPort(config)) for config in configs]
+        ports = [opened.enter_context(CanPort(config)) for config in configs]
+        before = set(threading.enumerate())
+        intakes = [Intake(port) for port in ports]
+        with Receiver(intakes) as receiver:
+            assert set(threading.enumerate()) == before
+            receiver.wait(0.1)
+            for number in range(100):
+                senders[number % 2].send(number, b"12345678")
+            got: dict[Intake, list[int]] = {intake: [] for intake in intakes}
+            end_s = clock.monotonic() + 0.02  # 50 frames of a bus take 6 ms, and gathering at most 7.5 ms
+            while clock.monotonic() < end_s:
+                for intake in receiver.wait(0.01):
+                    got[intake] += ids(intake.take())
+            assert [*got.values()] == [list(range(0, 100, 2)), list(range(1, 100, 2))]
+            ports[1].close()
+            closed_s = clock.monotonic()
+            while intakes[1] not in receiver.wait(0.01):
+                assert clock.monotonic() < closed_s + 0.05
+            with pytest.raises(BusError, match="can1"):
+                intakes[1].take()
 
 
 def test_an_error_is_raised_to_the_reader_after_the_frames_before_it() -> None:

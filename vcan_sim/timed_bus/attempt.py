@@ -87,9 +87,20 @@ def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: Bit
         esi: whether the senders are error-passive.
         rates: bit rates of the bus.
     """
+    return Course(senders, *undisturbed_times(frame, esi, rates))
+
+
+def undisturbed_times(frame: CanFrame, esi: bool, rates: BitRates) -> tuple[int, int, int]:
+    """Return ``end``, ``recessive`` and ``free`` of :class:`Course` for an undisturbed attempt, ticks.
+
+    Args:
+        frame: frame on the bus.
+        esi: whether the senders are error-passive.
+        rates: bit rates of the bus.
+    """
     free = rates.ticks(frame_bits(frame, esi))
     end = free - INTERMISSION_BITS * rates.nominal_ticks
-    return Course(senders, end, end - (ACK_TO_END_BITS - 1) * rates.nominal_ticks, free)
+    return end, end - (ACK_TO_END_BITS - 1) * rates.nominal_ticks, free
 
 
 def disturbed(

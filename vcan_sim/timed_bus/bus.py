@@ -14,7 +14,14 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from skinnode.errors import ConfigError
-from vcan_sim.timed_bus.attempt import BitError, Participant, cut_off, disturbed, undisturbed
+from vcan_sim.timed_bus.attempt import (
+    BitError,
+    Participant,
+    cut_off,
+    disturbed,
+    undisturbed,
+    undisturbed_times,
+)
 from vcan_sim.timed_bus.bit_rates import BitRates
 from vcan_sim.timed_bus.confinement import (
     RECOVERY_RUN_BITS,
@@ -65,6 +72,7 @@ class TimedBus:
     ) -> None:
         self._rates = rates or BitRates()
         self._bit = self._rates.nominal_ticks
+        self._ticks_per_ns = self._rates.ticks_per_ns
         self._stations = [Station(index, options) for index, options in enumerate(stations)]
         self._disturbances = Disturbances()
         self._now = 0
@@ -110,7 +118,8 @@ class TimedBus:
             return False
         self._number += 1
         sender.queue.push(Waiting(arbitration_key(frame), self._number, time_ns, frame))
-        self._offer(sender)
+        if station not in self._pending:  # otherwise, it takes part in the next arbitration already
+            self._offer(sender)
         return True
 
     def clear(self, time_ns: int, station: int) -> None:
@@ -310,11 +319,13 @@ class TimedBus:
     def _at(self, time_ns: int, station: int) -> Station:
         if not 0 <= station < len(self._stations):
             raise IndexError(f"station: got {station}, must be 0 to {len(self._stations) - 1}")
-        self._advance(time_ns)
+        up_to_date = self._next is None or self._next > self._now
+        if not up_to_date or time_ns * self._ticks_per_ns != self._now:
+            self._advance(time_ns)
         return self._stations[station]
 
     def _advance(self, time_ns: int) -> None:
-        ticks = time_ns * self._rates.ticks_per_ns
+        ticks = time_ns * self._ticks_per_ns
         if ticks < self._now:
             now_ns = self._rates.ceil_ns(self._now)
             raise ValueError(f"time_ns: got {time_ns}, must be at least {now_ns}, the time of the last call")
@@ -350,15 +361,16 @@ class TimedBus:
             return False
         waiting, start = flight.waiting[sender.index], flight.start
         free, end = start + course.free, start + course.end
-        ceil_ns, bit, queue = self._rates.ceil_ns, self._bit, sender.queue
+        rates, bit, queue = self._rates, self._bit, sender.queue
+        ceil_ns, events, frames = rates.ceil_ns, self._events, self._frames
         self._flight = self._start = self._next = None
         while end <= until:
             frame = waiting.frame
-            self._events.append(
+            events.append(
                 Delivered(ceil_ns(end), sender.index, frame, receivers, waiting.queued_ns, ceil_ns(start))
             )
             identifier = (frame.can_id, frame.extended)
-            self._frames[identifier] = self._frames.get(identifier, 0) + 1
+            frames[identifier] = frames.get(identifier, 0) + 1
             sender.sending, self._free = None, free
             if not pending:
                 return True
@@ -369,10 +381,11 @@ class TimedBus:
             sender.sending = waiting = queue.pop()
             if not len(queue):
                 pending.clear()
-            course = undisturbed(senders, waiting.frame, False, self._rates)
-            free, end = start + course.free, start + course.end
-            self._recessive_from = start + course.recessive
+            after_end, recessive, after_free = undisturbed_times(waiting.frame, False, rates)
+            free, end = start + after_free, start + after_end
+            self._recessive_from = start + recessive
             self._occupancy.add(ceil_ns(start), ceil_ns(free))
+        course = undisturbed(senders, waiting.frame, False, rates)
         self._flight = Flight(start, course, {sender.index: waiting}, senders, receivers)
         self._next = end
         return True

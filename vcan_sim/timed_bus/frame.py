@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple, Self
 
 from skinnode.bus_load.stuffing import classic_frame_bits
 from skinnode.bus_load.timing import exact_bits, exact_fd_bits
@@ -13,30 +12,55 @@ from skinnode.text.words import counted
 _VALID_FD_LENGTHS: Final = frozenset(FD_LENGTHS)
 
 
-@dataclass(frozen=True, slots=True)
-class CanFrame:
+class _Fields(NamedTuple):
+    can_id: int
+    data: bytes
+    extended: bool
+    remote: bool
+    dlc: int
+    fd: bool
+    brs: bool
+
+
+class CanFrame(_Fields):
     """Data frame or remote frame, classic CAN or CAN FD.
 
     The error state indicator (ESI) of a CAN FD frame is not included, because the controller sets it:
     dominant in an error-active station, recessive in an error-passive one.
 
+    Args:
+        can_id: Identifier of 11 bits, or of 29 bits if ``extended``.
+        data: Data: 0 to 8 bytes, and in CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty in a remote
+            frame.
+        extended: Whether the identifier has 29 bits.
+        remote: Whether the frame is a remote frame.
+        dlc: Data length code (DLC) of a remote frame, 0 to 8; ignored for data frames.
+        fd: Whether the frame is a CAN FD frame.
+        brs: Whether a CAN FD frame switches to the data bit rate.
+
     Raises:
         ValueError: if the identifier, the length or the combination of flags is not valid.
     """
 
-    can_id: int
-    """Identifier of 11 bits, or of 29 bits if ``extended``."""
-    data: bytes = b""
-    """Data: 0 to 8 bytes, and in CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty in a remote frame."""
-    extended: bool = False
-    remote: bool = False
-    dlc: int = 0
-    """Data length code (DLC) of a remote frame, 0 to 8; ignored for data frames."""
-    fd: bool = False
-    brs: bool = False
-    """Whether a CAN FD frame switches to the data bit rate."""
+    __slots__ = ()
 
-    def __post_init__(self) -> None:
+    def __new__(  # noqa: PLR0913 - the fields of a frame
+        cls,
+        can_id: int,
+        data: bytes = b"",
+        extended: bool = False,
+        remote: bool = False,
+        dlc: int = 0,
+        fd: bool = False,
+        brs: bool = False,
+    ) -> Self:
+        """Check the fields of a new frame."""
+        frame = tuple.__new__(cls, (can_id, data, extended, remote, dlc, fd, brs))
+        if extended or remote or fd or brs or dlc or not 0 <= can_id < 0x800 or len(data) > 8:
+            frame._check()
+        return frame
+
+    def _check(self) -> None:
         width = 29 if self.extended else 11
         if not 0 <= self.can_id < 1 << width:
             raise ValueError(f"can_id: got 0x{self.can_id:X}, must fit {width} bits")

@@ -83,12 +83,15 @@ class Acquisition:
         elif conversions != self._conversions:
             self.phase = self.phase % PHASES + 1
         self._conversions = conversions
-        self.codes = encode(resistance / readings, self.baseline_ohm, self.scale)
+        mean = resistance if readings == 1 else resistance / readings
+        self.codes = encode(mean, self.baseline_ohm, self.scale)
         self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
         """Return the (U, K) sum of several readings, ohm. ∞ − ∞ gives NaN, which is encoded as open."""
         total = self.read(t_ns)
+        if readings == 1:
+            return total
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(readings - 1):
                 total += self.read(t_ns)

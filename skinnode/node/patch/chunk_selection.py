@@ -24,6 +24,7 @@ class ChunkSelection:
         self._full_scan_due = True
         self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
         """(U, K) codes that were last sent; all open before the first scan."""
+        self._largest_sent: int = scale.open
 
     def forget(self) -> None:
         """Make the next scan a full scan, because the receiver may not have the codes that were last sent."""
@@ -46,11 +47,18 @@ class ChunkSelection:
         self._since_full += 1
         if self._full_scan_due or (full_every and self._since_full >= full_every):
             self._full_scan_due, self._since_full = False, 0
-            self.sent = codes
+            self._remember(codes)
             return None
-        moved = np.abs(codes.astype(np.int64) - self.sent) > threshold
+        apart = np.abs(np.subtract(codes, self.sent, dtype=np.int64))
+        largest = int(np.maximum.reduce(apart, axis=None))
+        if largest <= threshold and self._largest_sent + largest <= self._steps:
+            return []  # as in nearly every scan at rest
+        moved = apart > threshold
         moved |= ((codes > self._steps) | (self.sent > self._steps)) & (codes != self.sent)
         chunks = np.zeros(self._n_chunks, dtype=np.bool_)
         chunks[self._places[moved]] = True
-        self.sent = np.where(chunks[self._places], codes, self.sent)
+        self._remember(np.where(chunks[self._places], codes, self.sent))
         return [int(index) for index in np.flatnonzero(chunks)]
+
+    def _remember(self, sent: Codes) -> None:
+        self.sent, self._largest_sent = sent, int(sent.max())

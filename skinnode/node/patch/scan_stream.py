@@ -178,7 +178,8 @@ class ScanStream:
         self._scan, self._carrier, self._chunks_sent = scan, None, 0
         for tpdo in self._tpdos.owned(od.CHUNK):
             if tpdo.parameters.event_driven or tpdo.number in scan.turns:
-                self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
+                self._carrier = tpdo
+                self._verbatim = bool(scan.chunks) and self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
                 tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # no burst of chunks after a pause

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import struct
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from skinnode.protocol.profile import PatchProfile
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WireFaults:
     """Open and shorted wires of a patch."""
 
@@ -29,21 +30,29 @@ class WireFaults:
     lower_short: Mask
     """(K,) mask of the shorted lower wires."""
 
-    @classmethod
-    def none(cls, profile: PatchProfile) -> WireFaults:
+    @staticmethod
+    def none(profile: PatchProfile) -> WireFaults:
         """Return the value for a patch without wire faults."""
-        rows, columns = np.zeros(profile.rows, dtype=np.bool_), np.zeros(profile.columns, dtype=np.bool_)
-        return cls(rows, rows, columns, columns)
+        return _no_faults((profile.rows, profile.columns))
 
     @property
     def masks(self) -> tuple[Mask, Mask, Mask, Mask]:
         """All masks: upper open, upper shorted, lower open, lower shorted."""
         return self.upper_open, self.upper_short, self.lower_open, self.lower_short
 
-    @property
+    @functools.cached_property
     def any(self) -> bool:
         """Whether at least one wire is open or shorted."""
         return any(mask.any() for mask in self.masks)
+
+
+@functools.cache
+def _no_faults(shape: tuple[int, int]) -> WireFaults:
+    """Return the value for a patch with (U, K) wires and no wire faults. Its arrays are read-only."""
+    upper, lower = (np.zeros(wires, dtype=np.bool_) for wires in shape)
+    for mask in (upper, lower):
+        mask.flags.writeable = False
+    return WireFaults(upper, upper, lower, lower)
 
 
 def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
@@ -53,6 +62,8 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
         codes: (U, K) codes.
         scale: mapping of R/R0 to codes.
     """
+    if codes.max() < scale.short:  # as in nearly every scan
+        return _no_faults((codes.shape[0], codes.shape[1]))
     is_open, is_short = codes == scale.open, codes == scale.short
     return WireFaults(is_open.all(axis=1), is_short.all(axis=1), is_open.all(axis=0), is_short.all(axis=0))
 

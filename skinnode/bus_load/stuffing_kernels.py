@@ -17,6 +17,7 @@ from skinnode.compiled.jit import njit_brief
 def classic_one(  # noqa: PLR0913 - arrays of a compiled kernel
     head: int, length: int, high: int, low: int, crc_of: Any, run_of: Any
 ) -> int:
+    """Count the bits of a classic frame, given its 19-bit head and its data in two halves of 32 bits."""
     crc: Any = np.int64(crc_of[head >> 16])
     crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head >> 8 & 0xFF)])
     crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
@@ -45,6 +46,7 @@ def classic_one(  # noqa: PLR0913 - arrays of a compiled kernel
 def classic(  # noqa: PLR0913 - arrays of a compiled kernel
     ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run_of: Any, bits: Any
 ) -> int:
+    """Implement :func:`skinnode.bus_load.stuffing.classic_bits`."""
     total, begin = 0, 0
     for i in range(ids.size):
         length: Any = np.int64(lengths[i])
@@ -62,6 +64,7 @@ def classic(  # noqa: PLR0913 - arrays of a compiled kernel
 def fd(  # noqa: PLR0913 - arrays of a compiled kernel
     ids: Any, lengths: Any, payload: Any, run_of: Any, nominal: Any, fast: Any
 ) -> None:
+    """Implement :func:`skinnode.bus_load.stuffing.fd_bits`."""
     begin = 0
     for i in range(ids.size):
         length: Any = np.int64(lengths[i])

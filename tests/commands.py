@@ -1,0 +1,90 @@
+"""Run a command in the process of the test, as its entry point does: no start of Python for each message."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from unittest import mock
+
+import skinnode.cli.main
+import vcan_sim.cli
+
+MAINS = {"skinnode": skinnode.cli.main.main, "vcan-sim": vcan_sim.cli.main}
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+PATIENCE_S = 20.0
+
+
+class _Output(io.StringIO):
+    """What a command prints; it can wait for a line."""
+
+    def wait_for_lines(self, count: int) -> bool:
+        end_s = time.monotonic() + PATIENCE_S
+        while self.getvalue().count("\n") < count:
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(0.005)
+        return True
+
+
+def run_here(
+    *arguments: str, program: str = "skinnode", out: io.StringIO | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Exit status, stdout and stderr of ``skinnode`` or ``vcan-sim``."""
+    out, err, status = out or io.StringIO(), io.StringIO(), 0
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        mock.patch.object(sys, "argv", [program, *arguments]),  # the name of the program in messages
+        mock.patch.object(sys.modules["__main__"], "__package__", None),  # or it would be python -m pytest
+    ):
+        try:
+            MAINS[program](list(arguments))
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+    return subprocess.CompletedProcess(list(arguments), status, out.getvalue(), err.getvalue())
+
+
+def run_until_signal(
+    number: int, *arguments: str, program: str = "skinnode", after_lines: int = 0, after_s: float = 0.0
+) -> subprocess.CompletedProcess[str]:
+    """As :func:`run_here`, but the process gets signal ``number`` after so many lines and seconds.
+
+    The tests' own handlers are in place before: a command that leaves a signal to them has status -1."""
+    out = _Output()
+
+    def kill() -> None:
+        if out.wait_for_lines(after_lines):
+            time.sleep(after_s)
+        os.kill(os.getpid(), number)
+
+    with _unhandled() as missed:
+        killer = threading.Thread(target=kill)
+        killer.start()
+        try:
+            done = run_here(*arguments, program=program, out=out)
+        finally:
+            killer.join()
+    if missed:
+        done.returncode = -1
+    return done
+
+
+@contextlib.contextmanager
+def _unhandled() -> Iterator[list[int]]:
+    """The signals that no command handled in the meantime."""
+    missed: list[int] = []
+    kept = {
+        number: signal.signal(number, lambda received, _frame: missed.append(received)) for number in SIGNALS
+    }
+    try:
+        yield missed
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)

@@ -29,7 +29,9 @@ SKINNODE = Path(sys.executable).with_name("skinnode")
 
 def skinnode(*arguments: str) -> subprocess.CompletedProcess[str]:
     """The installed command, in a process of its own."""
-    return subprocess.run([str(SKINNODE), *arguments], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        [str(SKINNODE), *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 @functools.cache
@@ -159,7 +161,9 @@ def test_completion_is_written_for_the_shell() -> None:
     variables = {"_SKINNODE_COMPLETE": "complete_bash", "COMP_WORDS": "skinnode do", "COMP_CWORD": "1"}
     asked = completion(**variables)
     assert asked.split() == ["doctor"]
-    installed = subprocess.run([str(SKINNODE)], capture_output=True, text=True, env={**os.environ, **variables})
+    installed = subprocess.run(
+        [str(SKINNODE)], capture_output=True, text=True, env={**os.environ, **variables}
+    )
     assert installed.stdout == asked
 
 

@@ -23,6 +23,8 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node.patch.find_source import GROUP, load, make_source
 from skinnode.transport import CanPort, Frame
 
+from ..commands import run_here
+
 ROOT = Path(__file__).parents[2]
 SKINNODE = str(Path(sys.executable).with_name("skinnode"))
 WAIT_S = 10.0
@@ -122,10 +124,7 @@ def master(multicast_group: str) -> Iterator[Master]:
         yield Master(port)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_of_the_users_own_source(
-    sources: Path, multicast_group: str, master: Master, number: signal.Signals
-) -> None:
+def test_a_node_of_the_users_own_source(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--layout", "aligned", "--serial", "77", "--json"]
     with running(multicast_group, *options, cwd=sources) as process:
         assert bytes(master.next(0x704).data) == b"\0"
@@ -142,7 +141,7 @@ def test_a_node_of_the_users_own_source(
         assert bytes(master.next(0x584).data)[4] == 0x81
         process.stdout.readline()  # what runs where
         process.stdout.readline()  # the first second
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (1, "")  # the source failed
     *seconds, fault = [json.loads(line) for line in out.splitlines()]
@@ -171,10 +170,10 @@ def test_over_can_fd(sources: Path, multicast_group: str, master: Master) -> Non
 
 
 def test_ends_by_itself_and_says_how_it_does(sources: Path, multicast_group: str) -> None:
-    with running(multicast_group, "--source", "my_sources:Board", "--seconds", "1.2", cwd=sources) as process:
-        out, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (0, "")
-    head, *seconds = out.splitlines()
+    options = ["--source", "my_sources:Board", "--seconds", "1.2"]
+    done = run_here(*arguments(multicast_group, *options, node_id=4)[1:])
+    assert (done.returncode, done.stderr) == (0, "")
+    head, *seconds = done.stdout.splitlines()
     assert head.startswith("node 4 (10 × 30 wires, 16-bit codes, source my_sources:Board) on udp_multicast")
     assert [line.split("  ", 1)[1].strip() for line in seconds] == [
         "1.0 s  4  pre-operational  0 scans  1 frames",
@@ -213,9 +212,7 @@ def test_a_memory_that_is_of_no_use_is_a_fault(
 ) -> None:
     def run(*options: str) -> subprocess.CompletedProcess[str]:
         source = ["--source", "my_sources:Board", "--store", "patch.json", "--seconds", "0.2"]
-        command = arguments(multicast_group, *source, *options, node_id=4)
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+        return run_here(*arguments(multicast_group, *source, *options, node_id=4)[1:])
 
     if content is None:
         assert run("--code-bits", "24").returncode == 0
@@ -243,13 +240,7 @@ def test_two_processes_do_not_share_a_memory(sources: Path, multicast_group: str
 def test_a_memory_is_not_looked_for_behind_a_symbolic_link(sources: Path, multicast_group: str) -> None:
     (sources / "patch.json").symlink_to(sources / "elsewhere")
     options = ["--source", "my_sources:Board", "--store", "patch.json", "--seconds", "0.1"]
-    done = subprocess.run(
-        arguments(multicast_group, *options, node_id=4),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
+    done = run_here(*arguments(multicast_group, *options, node_id=4)[1:])
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: --store: got 'patch.json', allowed: a file, not a symbolic link\n"
 
@@ -335,9 +326,7 @@ def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -
     ],
 )
 def test_options_that_cannot_be(sources: Path, options: list[str], says: str) -> None:
-    command = [SKINNODE, "node", "--source", "my_sources:Board", "--interface", "virtual", *options]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    done = run_here("node", "--source", "my_sources:Board", "--interface", "virtual", *options)
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(says)
@@ -369,10 +358,9 @@ def test_a_source_that_is_none_is_one_line(sources: Path, name: str, says: str) 
 def test_a_bad_source_ends_with_status_2_before_a_frame_is_sent(
     sources: Path, multicast_group: str, master: Master
 ) -> None:
-    with running(multicast_group, "--source", "my_sources:dead", cwd=sources) as process:
-        out, err = process.communicate(timeout=30)
-    assert (process.returncode, out) == (2, "")
-    (line,) = err.splitlines()
+    done = run_here(*arguments(multicast_group, "--source", "my_sources:dead", node_id=4)[1:])
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
     assert line.startswith(
         "error: --source: got 'my_sources:dead', allowed: a source that returns readings ("
     )

@@ -136,14 +136,9 @@ def test_a_signal_during_imports(folder: Path, arguments: list[str], modules: li
     assert all(status == 128 + number for _, number, status in ended), ended
 
 
-@contextlib.contextmanager
-def simulated(folder: Path) -> Iterator[None]:
-    with start(["vcan-sim", "hand.toml"], folder) as simulator:
-        assert simulator.stdout is not None
-        assert "1 patch" in simulator.stdout.readline()
-        yield
-        simulator.terminate()
-        simulator.communicate(timeout=20)
+def simulated(folder: Path) -> Fleet:
+    """The nodes of the hand, in the process of the test."""
+    return Fleet(load_hand(folder / "hand.toml"))
 
 
 BUS = ["--hand", "hand.toml"]

@@ -161,7 +161,7 @@ def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -
 def test_host_that_is_killed_is_followed_by_another(shared: tuple[Path, BusConfig]) -> None:
     """The nodes go on without it; the next one takes them up."""
     path, bus = shared
-    with process([*SIMULATOR, str(path)]):
+    with Fleet(load_hand(path)):
         with process([*HOST, str(path)]) as killed:
             assert killed.says("thumb operational")
             killed.end(signal.SIGKILL)
@@ -181,7 +181,7 @@ def test_interrupted_while_it_waits_for_nodes(shared: tuple[Path, BusConfig]) ->
 
 def test_wrong_length_is_one_line_and_status_2(shared: tuple[Path, BusConfig]) -> None:
     path, bus = shared
-    with process([*SIMULATOR, str(path)]), process([*HOST, str(path)]) as host:
+    with Fleet(load_hand(path)), process([*HOST, str(path)]) as host:
         assert host.says("operational on can0")
         with CanPort(bus) as stranger:
             stranger.send(0x18B, bytes(7))

@@ -85,7 +85,7 @@ __all__ = ["BringUpCancelled", "Condition", "HandFrame", "Host", "HostStats", "P
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use: commands that solve no scan use parts of a host without the solver."""
+    """Import a public name on first use: many commands use parts of a host, but not the solver."""
     if name not in _HOME:
         raise AttributeError(f"module 'skinnode.host' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOME[name]), name)

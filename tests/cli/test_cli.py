@@ -83,6 +83,18 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_what_diagnoses_or_simulates_loads_no_solver() -> None:
+    """Numba and the solver take half a second; a node, the doctor and `skinnode scan` need neither."""
+    code = (
+        "import importlib, pkgutil, sys, skinnode.diagnose, skinnode.node, vcan_sim.fleet\n"
+        "for found in pkgutil.walk_packages(skinnode.diagnose.__path__, 'skinnode.diagnose.'):\n"
+        "    importlib.import_module(found.name)\n"
+        "print([name for name in ('numba', 'skinnode.solve') if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_version() -> None:
     import skinnode
 

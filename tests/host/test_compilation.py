@@ -10,6 +10,7 @@ import sys
 PROGRAM = """
 import gc, json, os, sys
 import numpy as np
+import scipy.special  # or each copy would import it
 from numba.core.registry import CPUDispatcher
 from skinnode.bench.trust_faults import singles
 from skinnode.bench.trust_loads import draw

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from unittest import mock
 
 import skinnode.cli.main
@@ -21,12 +22,13 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PATIENCE_S = 20.0
 
 
-class _Output(io.StringIO):
-    """What a command prints; it can wait for a line."""
+class Output(io.StringIO):
+    """What a command prints; it can wait for a text."""
 
-    def wait_for_lines(self, count: int) -> bool:
+    def has(self, text: str, count: int = 1) -> bool:
+        """Whether ``text`` comes so many times."""
         end_s = time.monotonic() + PATIENCE_S
-        while self.getvalue().count("\n") < count:
+        while self.getvalue().count(text) < count:
             if time.monotonic() > end_s:
                 return False
             time.sleep(0.005)
@@ -43,6 +45,7 @@ def run_here(
         contextlib.redirect_stderr(err),
         mock.patch.object(sys, "argv", [program, *arguments]),  # the name of the program in messages
         mock.patch.object(sys.modules["__main__"], "__package__", None),  # or it would be python -m pytest
+        mock.patch.object(logging.root, "handlers", []),  # Python itself prints warnings, on stderr
     ):
         try:
             MAINS[program](list(arguments))
@@ -52,17 +55,18 @@ def run_here(
 
 
 def run_until_signal(
-    number: int, *arguments: str, program: str = "skinnode", after_lines: int = 0, after_s: float = 0.0
+    number: int, *arguments: str, when: Callable[[Output], object], program: str = "skinnode"
 ) -> subprocess.CompletedProcess[str]:
-    """As :func:`run_here`, but the process gets signal ``number`` after so many lines and seconds.
+    """As :func:`run_here`, but the process gets signal ``number`` once ``when``, on another thread, returns.
 
-    The tests' own handlers are in place before: a command that leaves a signal to them has status -1."""
-    out = _Output()
+    A command that leaves the signal to the handlers of the tests has status -1."""
+    out = Output()
 
     def kill() -> None:
-        if out.wait_for_lines(after_lines):
-            time.sleep(after_s)
-        os.kill(os.getpid(), number)
+        try:
+            when(out)
+        finally:
+            os.kill(os.getpid(), number)
 
     with _unhandled() as missed:
         killer = threading.Thread(target=kill)

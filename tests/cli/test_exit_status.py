@@ -154,8 +154,10 @@ UNTIL_TOLD = {
 }
 
 
-IN_PROCESSES = list(zip(UNTIL_TOLD, [1, 2, 15, 1, 15], strict=True))
-"""Each command with one signal; :func:`test_every_signal_ends_what_runs_until_it_is_told` has the others."""
+IN_PROCESSES = [("record", signal.SIGHUP), ("monitor", signal.SIGTERM), ("node", signal.SIGINT)]
+"""Commands in processes of their own; tests/host/test_host_command.py has those of ``host`` and ``vcan-sim``.
+
+:func:`test_every_signal_ends_what_runs_until_it_is_told` has every signal."""
 
 
 def marked(cases: list[tuple[str, int]]) -> Iterator[object]:
@@ -202,7 +204,7 @@ def test_every_signal_ends_what_runs_until_it_is_told(
     program, *arguments = [words.get(word, word) for word in UNTIL_TOLD[command]]
     for _ in range(3):
         with Fleet(load_hand("hand.toml")) if command in ("host", "monitor") else contextlib.nullcontext():
-            done = run_until_signal(number, *arguments, program=program, after_lines=2)
+            done = run_until_signal(number, *arguments, program=program, when=lambda said: said.has("\n", 2))
         if not is_stall(done.stderr):
             break
         assert done.returncode == 1
@@ -259,7 +261,7 @@ def test_what_has_an_end_did_not_come_to_it(
 @pytest.mark.parametrize("number", SIGNALS)
 def test_every_signal_ends_a_search(folder: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     monkeypatch.chdir(folder)
-    done = run_until_signal(number, "scan", *BUS, after_s=0.2)
+    done = run_until_signal(number, "scan", *BUS, when=lambda _: time.sleep(0.2))
     assert (done.returncode, done.stderr) == (128 + number, "")
 
 

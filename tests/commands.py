@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import TextIO
 from unittest import mock
 
 import skinnode.cli.main
@@ -36,10 +37,10 @@ class Output(io.StringIO):
 
 
 def run_here(
-    *arguments: str, program: str = "skinnode", out: io.StringIO | None = None
+    *arguments: str, program: str = "skinnode", out: TextIO | None = None
 ) -> subprocess.CompletedProcess[str]:
     """Exit status, stdout and stderr of ``skinnode`` or ``vcan-sim``."""
-    out, err, status = out or io.StringIO(), io.StringIO(), 0
+    out, err, status = out or Output(), io.StringIO(), 0
     with (
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
@@ -51,7 +52,23 @@ def run_here(
             MAINS[program](list(arguments))
         except SystemExit as ended:
             status = int(ended.code or 0)
-    return subprocess.CompletedProcess(list(arguments), status, out.getvalue(), err.getvalue())
+    said = out.getvalue() if isinstance(out, Output) else ""
+    return subprocess.CompletedProcess(list(arguments), status, said, err.getvalue())
+
+
+def run_for_nobody(*arguments: str, program: str = "skinnode") -> subprocess.CompletedProcess[str]:
+    """As :func:`run_here`, but nobody reads its output: the pipe is closed."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    kept = [os.dup(descriptor) for descriptor in (1, 2)]  # such a command closes those of its process
+    try:
+        with contextlib.suppress(BrokenPipeError), open(writing, "w") as closed:
+            done = run_here(*arguments, program=program, out=closed)
+    finally:
+        for descriptor, copy in zip((1, 2), kept, strict=True):
+            os.dup2(copy, descriptor)
+            os.close(copy)
+    return done
 
 
 def run_until_signal(

@@ -23,7 +23,7 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node.patch.find_source import GROUP, load, make_source
 from skinnode.transport import CanPort, Frame
 
-from ..commands import run_here
+from ..commands import Output, run_here, run_until_signal
 
 ROOT = Path(__file__).parents[2]
 SKINNODE = str(Path(sys.executable).with_name("skinnode"))
@@ -155,18 +155,20 @@ def test_a_node_of_the_users_own_source(sources: Path, multicast_group: str, mas
 
 def test_over_can_fd(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--fd", "--code-bits", "24", "--strict-timing"]
-    with running(multicast_group, *options, cwd=sources) as process:
+
+    def receive(_: Output) -> None:
         master.next(0x704)
         master.send(0x000, "01 04")
         master.send(0x080, "")
         chunks = [master.next(0x184) for _ in range(20)]
         assert {(frame.fd, len(frame.data)) for frame in chunks} == {(True, 64)}
         assert bytes(master.next(0x284).data)[2] == 20
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, "")
-    assert "10 × 30 wires, 24-bit codes" in out.splitlines()[0]
-    assert "CAN FD" in out.splitlines()[0]
+
+    done = run_until_signal(signal.SIGINT, *arguments(multicast_group, *options, node_id=4)[1:], when=receive)
+    assert (done.returncode, done.stderr) == (0, "")
+    head = done.stdout.splitlines()[0]
+    assert "10 × 30 wires, 24-bit codes" in head
+    assert "CAN FD" in head
 
 
 def test_ends_by_itself_and_says_how_it_does(sources: Path, multicast_group: str) -> None:
@@ -185,18 +187,22 @@ def test_what_was_stored_is_there_at_the_next_start(
     sources: Path, multicast_group: str, master: Master
 ) -> None:
     options = ["--source", "my_sources:Board", "--store", "patch.json"]
-    for start in range(2):
-        with running(multicast_group, *options, cwd=sources) as process:
-            master.next(0x704)
-            master.send(0x604, "40 20 20 02 00 00 00 00")
-            assert bytes(master.next(0x584).data)[4] == (2, 99)[start]
-            if not start:
-                for request in ("2b 20 20 02 63 00 00 00", "23 10 10 01 73 61 76 65"):
-                    master.send(0x604, request)
-                    assert bytes(master.next(0x584).data)[0] == 0x60
-            process.send_signal(signal.SIGTERM)
-            _, err = process.communicate(timeout=20)
-            assert (process.returncode, err) == (0, "")
+
+    def at_the_first_start(_: Output) -> None:
+        ask_for(2)
+        for request in ("2b 20 20 02 63 00 00 00", "23 10 10 01 73 61 76 65"):
+            master.send(0x604, request)
+            assert bytes(master.next(0x584).data)[0] == 0x60
+
+    def ask_for(value: int) -> None:
+        master.next(0x704)
+        master.send(0x604, "40 20 20 02 00 00 00 00")
+        assert bytes(master.next(0x584).data)[4] == value
+
+    for when in (at_the_first_start, lambda _: ask_for(99)):
+        command = arguments(multicast_group, *options, node_id=4)[1:]
+        done = run_until_signal(signal.SIGTERM, *command, when=when)
+        assert (done.returncode, done.stderr) == (0, "")
     assert [file.name for file in sources.iterdir() if "patch.json" in file.name] == ["patch.json"]
 
 
@@ -285,14 +291,15 @@ def test_a_memory_is_a_regular_file_and_so_is_its_lock(sources: Path, kind: str,
 def test_another_node_with_the_same_node_id_is_a_fault(
     sources: Path, multicast_group: str, master: Master
 ) -> None:
-    with running(multicast_group, "--source", "my_sources:Board", cwd=sources) as process:
+    def interfere(_: Output) -> None:
         assert bytes(master.next(0x704).data) == b"\0"
         master.send(0x704, "00")
         assert bytes(master.next(0x084).data)[:2] == b"\x50\x81"
-        process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=20)
-        assert (process.returncode, err) == (1, "")
-        assert "fault: 1 boot-up or heartbeat from another node with this node-ID" in out
+
+    command = arguments(multicast_group, "--source", "my_sources:Board", node_id=4)[1:]
+    done = run_until_signal(signal.SIGTERM, *command, when=interfere)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert "fault: 1 boot-up or heartbeat from another node with this node-ID" in done.stdout
 
 
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:

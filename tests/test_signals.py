@@ -12,14 +12,16 @@ import time
 from skinnode.process.signals import SignalEvent
 
 PROGRAM = """
-import os, random, signal, threading, time
+import os, random, signal, sys, threading, time
 from skinnode.process.signals import stop_on_signal
+
+sys.setswitchinterval(1e-5)  # or the loop below would keep the other thread waiting for 5 ms
 
 def kill():
     time.sleep(random.uniform(0.0, 1e-4))
     os.kill(os.getpid(), signal.SIGTERM)
 
-for _ in range(800):
+for _ in range(2000):
     with stop_on_signal() as stop:
         killer = threading.Thread(target=kill)
         killer.start()

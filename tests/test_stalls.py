@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -50,9 +51,10 @@ def run(folder: Path, *options: str, fails_in_setup: bool = False, third: bool =
     """Exit status and output of pytest, run with the plugin of these tests on a module of its own."""
     path = folder / "test_module.py"
     path.write_text(MODULE.format(fails_in_setup=fails_in_setup, third=third))
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.stalls", "-p", "no:cacheprovider"]
-    command += [f"--rootdir={folder}", "-c", "/dev/null", *options, str(path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.stalls", "-p", "xdist"]
+    command += ["-p", "no:cacheprovider", f"--rootdir={folder}", "-c", "/dev/null", *options, str(path)]
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
     return done.returncode, done.stdout
 
 

@@ -35,7 +35,7 @@ _KERNEL_FILES = (
     "solve/*.py",
     "solve/*/*.py",
     "solve/posterior/local/*.py",
-    "bus_load/stuffing.py",
+    "bus_load/stuffing*.py",
     "host/repeated_codes.py",
 )
 

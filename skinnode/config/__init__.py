@@ -11,6 +11,8 @@
 and values allowed. Values must have the right TOML type, because they are not converted: ``node_id = "3"`` is
 an error.
 
+``schema`` generates the JSON Schema. ``descriptions`` reads the descriptions of keys from the source code.
+
 The suffix of a key gives the unit. A key without such a suffix contains a count, a ratio or a name.
 """
 

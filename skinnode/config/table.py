@@ -21,10 +21,11 @@ class Allowed:
 class Table(BaseModel):
     """Base class for the tables of the hand file.
 
-    The docstring of a key is its description in the JSON Schema.
+    The docstring of a key is its description in the JSON Schema
+    (:func:`skinnode.config.descriptions.descriptions_of`).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 def one_of(names: Any) -> Allowed:

@@ -87,6 +87,7 @@ class NoiseAnalysis:
         return int(self.touched.sum()) >= _TOUCHED
 
 
+@functools.lru_cache(maxsize=16)  # three checks and the report ask for the same patches
 def analyse_noise(scans: ScanFacts) -> NoiseAnalysis:
     """Analyse the noise of a patch; ``scans`` must contain at least :data:`LEAST_SCANS` scans."""
     ratio = scans.ratio[scans.complete] if scans.complete.sum() >= LEAST_SCANS else scans.ratio

@@ -59,10 +59,35 @@ the user's  subscriptions, hand frames      that iteration                  when
 ==========  ==============================  ==============================  ==============================
 """
 
-from skinnode.host.hand_frame import HandFrame
-from skinnode.host.health import Condition, PatchHealth
-from skinnode.host.host import Host, HostStats
-from skinnode.host.publish import Subscription
-from skinnode.host.start import BringUpCancelled
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skinnode.host.hand_frame import HandFrame
+    from skinnode.host.health import Condition, PatchHealth
+    from skinnode.host.host import Host, HostStats
+    from skinnode.host.publish import Subscription
+    from skinnode.host.start import BringUpCancelled
+
+_HOME = {
+    "BringUpCancelled": "skinnode.host.start",
+    "Condition": "skinnode.host.health",
+    "HandFrame": "skinnode.host.hand_frame",
+    "Host": "skinnode.host.host",
+    "HostStats": "skinnode.host.host",
+    "PatchHealth": "skinnode.host.health",
+    "Subscription": "skinnode.host.publish",
+}
 
 __all__ = ["BringUpCancelled", "Condition", "HandFrame", "Host", "HostStats", "PatchHealth", "Subscription"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use: many commands use parts of a host, but not the solver."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'skinnode.host' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value

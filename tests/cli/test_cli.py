@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import os
@@ -11,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import typer.main
@@ -20,12 +22,15 @@ from skinnode import cli
 from skinnode.cli.main import app as skinnode_app
 from vcan_sim.cli import app as simulator_app
 
+from ..commands import run_here
+
 SKINNODE = Path(sys.executable).with_name("skinnode")
 
 
-def skinnode(*arguments: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+def skinnode(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The installed command, in a process of its own."""
     return subprocess.run(
-        [str(SKINNODE), *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
+        [str(SKINNODE), *arguments], capture_output=True, text=True, timeout=60, check=False
     )
 
 
@@ -42,7 +47,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
 def test_help_and_page_name_the_command(command: str) -> None:
     assert f" {command} " in help_of_all()
     assert f"skinnode {command}" in PAGE
-    done = skinnode(command, "--help")
+    done = run_here(command, "--help")
     assert done.returncode == 0
     assert "Usage" in done.stdout
     assert done.stderr == ""
@@ -74,6 +79,18 @@ def test_help_breaks_lines_only_where_the_terminal_ends(
 def test_help_loads_nothing_heavy() -> None:
     heavy = ("numba", "scipy", "can", "canopen", "matplotlib", "numpy", "pydantic")
     code = f"import skinnode.cli.main, sys; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_what_diagnoses_or_simulates_loads_no_solver() -> None:
+    """Numba and the solver take half a second; a node, the doctor and `skinnode scan` need neither."""
+    code = (
+        "import importlib, pkgutil, sys, skinnode.diagnose, skinnode.node, vcan_sim.fleet\n"
+        "for found in pkgutil.walk_packages(skinnode.diagnose.__path__, 'skinnode.diagnose.'):\n"
+        "    importlib.import_module(found.name)\n"
+        "print([name for name in ('numba', 'skinnode.solve') if name in sys.modules])\n"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -129,15 +146,21 @@ def skinnode_version() -> str:
     ],
 )
 def test_wrong_usage_is_one_line_and_status_2(arguments: str, line: str) -> None:
-    done = skinnode(*arguments.split())
+    done = run_here(*arguments.split())
     assert done.returncode == 2
     assert done.stdout == ""
     (said,) = done.stderr.splitlines()
     assert said.startswith(f"error: {line}")
 
 
+def test_wrong_usage_of_the_installed_command() -> None:
+    done = skinnode("scan", "--bitrate", "x")
+    said = "error: skinnode scan: --bitrate: got 'x', allowed: an integer\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+
+
 def test_a_group_without_a_command_shows_its_help() -> None:
-    done = skinnode("lss")
+    done = run_here("lss")
     assert done.returncode == 2
     assert "list" in done.stdout + done.stderr
     assert "Traceback" not in done.stderr
@@ -147,8 +170,13 @@ def test_completion_is_written_for_the_shell() -> None:
     """What ``skinnode --install-completion`` installs; ``--show-completion`` prints it by itself."""
     script = completion(_SKINNODE_COMPLETE="source_bash")
     assert "_SKINNODE_COMPLETE=complete_bash" in script
-    asked = completion(_SKINNODE_COMPLETE="complete_bash", COMP_WORDS="skinnode do", COMP_CWORD="1")
+    variables = {"_SKINNODE_COMPLETE": "complete_bash", "COMP_WORDS": "skinnode do", "COMP_CWORD": "1"}
+    asked = completion(**variables)
     assert asked.split() == ["doctor"]
+    installed = subprocess.run(
+        [str(SKINNODE)], capture_output=True, text=True, env={**os.environ, **variables}
+    )
+    assert installed.stdout == asked
 
 
 HAND = """
@@ -193,31 +221,29 @@ def test_nodes_are_those_of_the_hand_that_lies_there(tmp_path: Path) -> None:
 
 
 def test_the_simulator_is_completed_too(tmp_path: Path) -> None:
-    program = SKINNODE.with_name("vcan-sim")
+    program = "vcan-sim"
     script = completion(program, _VCAN_SIM_COMPLETE="source_bash")
     assert "_VCAN_SIM_COMPLETE=complete_bash" in script
     assert offers("vcan-sim --fa", tmp_path, program) == ["--fault"]
 
 
-def offers(words: str, folder: Path, program: Path = SKINNODE) -> list[str]:
+def offers(words: str, folder: Path, program: str = "skinnode") -> list[str]:
     """What a shell offers for the last word of a line."""
-    variable = f"_{program.name.upper().replace('-', '_')}_COMPLETE"
+    variable = f"_{program.upper().replace('-', '_')}_COMPLETE"
     count = str(len(words.split(" ")) - 1)
     asked = {variable: "complete_bash", "COMP_WORDS": words, "COMP_CWORD": count}
     return completion(program, folder, **asked).split()
 
 
-def completion(program: Path = SKINNODE, folder: Path | None = None, **environment: str) -> str:
-    environment = {**os.environ, **environment}
-    return subprocess.run(
-        [str(program)], capture_output=True, text=True, env=environment, check=False, cwd=folder
-    ).stdout
+def completion(program: str = "skinnode", folder: Path | None = None, **environment: str) -> str:
+    with mock.patch.dict(os.environ, environment), contextlib.chdir(folder or Path.cwd()):
+        return run_here(program=program).stdout
 
 
 @pytest.mark.parametrize("option", ["--json", "--plot"])
 def test_a_file_that_cannot_be_written_is_known_before_the_demo_starts(option: str, tmp_path: Path) -> None:
     target = tmp_path / "no such folder" / "file.png"
-    done = skinnode("demo", option, str(target))
+    done = run_here("demo", option, str(target))
     assert done.returncode == 2
     assert done.stdout == ""
     (line,) = done.stderr.strip().splitlines()
@@ -227,7 +253,7 @@ def test_a_file_that_cannot_be_written_is_known_before_the_demo_starts(option: s
 
 
 def test_a_plot_of_no_known_kind_is_refused(tmp_path: Path) -> None:
-    done = skinnode("demo", "--plot", str(tmp_path / "plot.doc"))
+    done = run_here("demo", "--plot", str(tmp_path / "plot.doc"))
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
     assert "png" in line

@@ -3,33 +3,53 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 import pytest
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from skinnode.config import BusConfig, load_hand
+from vcan_sim.fleet import Fleet
+
+from ..commands import SIGNALS, run_for_nobody, run_until_signal
+
 PROGRAMS = {"skinnode": "skinnode.cli.main", "vcan-sim": "vcan_sim.cli"}
 
 HOOKED = """
-import os, sys
+import json, os, signal, sys
+
+modules, ended = {modules!r}, []
 
 class Hook:
     def find_spec(self, name, path, target=None):
-        if name == {module!r}:
-            os.kill(os.getpid(), {number})
+        if name not in modules:
+            return
+        modules.remove(name)
+        for number in {numbers!r}:  # each comes to a copy of the process that is just here
+            child = os.fork()
+            if child == 0:
+                os.kill(os.getpid(), number)
+                return
+            ended.append([name, number, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])])
+        if not modules:
+            os.write({result}, json.dumps(ended).encode())
+            os._exit(0)
 
 sys.meta_path.insert(0, Hook())
 sys.argv = {arguments!r}
 from {program} import main
 main()
 """
+"""A program that is sent each signal each time it begins to import one of ``modules``."""
 
 
 def start(arguments: Sequence[str], folder: Path, **options: object) -> subprocess.Popen[str]:
@@ -65,33 +85,39 @@ def handles_signals(process: subprocess.Popen[str]) -> None:
 @pytest.fixture
 def folder(tmp_path: Path, multicast_group: str) -> Path:
     """A hand of one small patch on a bus that processes share, which nobody else uses."""
-    sizes = "upper_wires = 2, upper_electrodes = 2, lower_wires = 6, lower_electrodes = 2"
-    (tmp_path / "hand.toml").write_text(
-        f'[[buses]]\nname = "can0"\ninterface = "udp_multicast"\nchannel = "{multicast_group}"\n'
-        f'[sync]\nperiod_ms = 250\n[[patches]]\nname = "thumb"\nnode_id = 5\ntolerances = "exact"\n'
-        f'layout = {{ preset = "staggered", {sizes} }}\n'
-    )
+    (tmp_path / "hand.toml").write_text(hand_text("udp_multicast", multicast_group))
     return tmp_path
 
 
-@pytest.mark.parametrize("number", SIGNALS)
+def hand_text(interface: str, channel: str) -> str:
+    """The hand file of one small patch."""
+    sizes = "upper_wires = 2, upper_electrodes = 2, lower_wires = 6, lower_electrodes = 2"
+    return (
+        f'[[buses]]\nname = "can0"\ninterface = "{interface}"\nchannel = "{channel}"\n'
+        f'[sync]\nperiod_ms = 250\n[[patches]]\nname = "thumb"\nnode_id = 5\ntolerances = "exact"\n'
+        f'layout = {{ preset = "staggered", {sizes} }}\n'
+    )
+
+
 @pytest.mark.parametrize(
-    ("module", "arguments"),
+    ("arguments", "modules"),
     [
-        ("typer", ["skinnode", "scan"]),
-        ("skinnode.cli._errors", ["skinnode", "--help"]),
-        ("skinnode.cli.lss", ["skinnode", "--help"]),
-        ("pydantic", ["skinnode", "hand", "check", "hand.toml"]),
-        ("numpy", ["skinnode", "hand", "check", "hand.toml"]),
-        ("numba", ["skinnode", "hand", "check", "hand.toml"]),
-        ("can", ["skinnode", "scan"]),
-        ("typer", ["vcan-sim", "hand.toml"]),
-        ("skinnode.node", ["vcan-sim", "hand.toml"]),
+        (["skinnode", "scan"], ["typer", "can"]),
+        (["skinnode", "--help"], ["skinnode.cli._errors", "skinnode.cli.lss"]),
+        (["skinnode", "hand", "check", "hand.toml"], ["pydantic", "numpy", "numba"]),
+        (["vcan-sim", "hand.toml"], ["typer", "skinnode.node"]),
     ],
+    ids=lambda words: " ".join(words),
 )
-def test_a_signal_during_imports(folder: Path, module: str, arguments: list[str], number: int) -> None:
-    program = PROGRAMS[arguments[0]]
-    code = HOOKED.format(module=module, number=int(number), arguments=arguments, program=program)
+def test_a_signal_during_imports(folder: Path, arguments: list[str], modules: list[str]) -> None:
+    result, theirs = os.pipe()
+    code = HOOKED.format(
+        modules=modules,
+        numbers=[int(number) for number in SIGNALS],
+        result=theirs,
+        arguments=arguments,
+        program=PROGRAMS[arguments[0]],
+    )
     done = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -99,19 +125,20 @@ def test_a_signal_during_imports(folder: Path, module: str, arguments: list[str]
         cwd=folder,
         timeout=60,
         check=False,
+        pass_fds=[theirs],
         preexec_fn=lambda: [signal.signal(each, signal.SIG_DFL) for each in SIGNALS],
     )
-    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "")
+    os.close(theirs)
+    with open(result) as pipe:
+        ended = json.loads(pipe.read())
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert sorted((name, number) for name, number, _ in ended) == sorted(product(modules, SIGNALS))
+    assert all(status == 128 + number for _, number, status in ended), ended
 
 
-@contextlib.contextmanager
-def simulated(folder: Path) -> Iterator[None]:
-    with start(["vcan-sim", "hand.toml"], folder) as simulator:
-        assert simulator.stdout is not None
-        assert "1 patch" in simulator.stdout.readline()
-        yield
-        simulator.terminate()
-        simulator.communicate(timeout=20)
+def simulated(folder: Path) -> Fleet:
+    """The nodes of the hand, in the process of the test."""
+    return Fleet(load_hand(folder / "hand.toml"))
 
 
 BUS = ["--hand", "hand.toml"]
@@ -127,15 +154,25 @@ UNTIL_TOLD = {
 }
 
 
-def until_told() -> Iterator[object]:
-    """Every command with its signals; the host counts the scans of another process, in real time."""
-    for command in UNTIL_TOLD:
+IN_PROCESSES = [("record", signal.SIGHUP), ("monitor", signal.SIGTERM), ("node", signal.SIGINT)]
+"""Commands in processes of their own; tests/host/test_host_command.py has those of ``host`` and ``vcan-sim``.
+
+:func:`test_every_signal_ends_what_runs_until_it_is_told` has every signal."""
+
+
+def marked(cases: list[tuple[str, int]]) -> Iterator[object]:
+    """The host and the monitor count the scans of another process or thread, in real time."""
+    for command, number in cases:
         marks = [pytest.mark.real_time] if command in ("host", "monitor") else []
-        for number in SIGNALS[: 2 if command == "monitor" else 3]:
-            yield pytest.param(command, number, marks=marks)
+        yield pytest.param(command, number, marks=marks)
 
 
-@pytest.mark.parametrize(("command", "number"), list(until_told()))
+def is_stall(err: str) -> bool:
+    """Whether the machine stood still for a scan."""
+    return re.fullmatch(r"(fault: \w+: \d+ scans? missed\n)+", err) is not None
+
+
+@pytest.mark.parametrize(("command", "number"), list(marked(IN_PROCESSES)))
 def test_what_runs_until_it_is_told_has_done_its_work(
     folder: Path, multicast_group: str, command: str, number: int
 ) -> None:
@@ -150,10 +187,29 @@ def test_what_runs_until_it_is_told_has_done_its_work(
             process.stdout.readline()
             process.send_signal(number)
             _, err = process.communicate(timeout=30)
-        if not re.fullmatch(r"(fault: \w+: \d+ scans? missed\n)+", err):
+        if not is_stall(err):
             break
-        assert process.returncode == 1  # the machine stood still for a scan: tried again
+        assert process.returncode == 1
     assert (process.returncode, err) == (0, "")
+
+
+@pytest.mark.parametrize(("command", "number"), list(marked(list(product(UNTIL_TOLD, SIGNALS)))))
+def test_every_signal_ends_what_runs_until_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, number: int
+) -> None:
+    bus = BusConfig(name="can0", interface="virtual", channel=uuid.uuid4().hex)
+    (tmp_path / "hand.toml").write_text(hand_text(bus.interface, bus.channel))
+    monkeypatch.chdir(tmp_path)
+    words = {"MULTICAST GROUP": bus.channel, "udp_multicast": bus.interface}
+    program, *arguments = [words.get(word, word) for word in UNTIL_TOLD[command]]
+    for _ in range(3):
+        with Fleet(load_hand("hand.toml")) if command in ("host", "monitor") else contextlib.nullcontext():
+            done = run_until_signal(number, *arguments, program=program, when=lambda said: said.has("\n", 2))
+        if not is_stall(done.stderr):
+            break
+        assert done.returncode == 1
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("\n") >= 2
 
 
 WITH_AN_END = {
@@ -182,8 +238,7 @@ WITH_AN_END = {
 
 @pytest.mark.parametrize(
     ("command", "number"),
-    [(command, SIGNALS[turn % 3]) for turn, command in enumerate(WITH_AN_END)]
-    + [("scan", number) for number in SIGNALS if number != SIGNALS[1]],
+    [(command, SIGNALS[turn % 3]) for turn, command in enumerate(WITH_AN_END)],
 )
 def test_what_has_an_end_did_not_come_to_it(
     folder: Path, command: str, number: int, multicast_group: str
@@ -201,6 +256,13 @@ def test_what_has_an_end_did_not_come_to_it(
         _, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (128 + number, "")
     assert time.monotonic() - begun_s < 10.0
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_every_signal_ends_a_search(folder: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    monkeypatch.chdir(folder)
+    done = run_until_signal(number, "scan", *BUS, when=lambda _: time.sleep(0.2))
+    assert (done.returncode, done.stderr) == (128 + number, "")
 
 
 STARTING = """
@@ -223,8 +285,11 @@ main()
 """
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-@pytest.mark.parametrize("turn", [1, 2, 3], ids=["resource tracker", "first process", "second process"])
+@pytest.mark.parametrize(
+    ("turn", "number"),
+    list(zip([1, 2, 3], SIGNALS, strict=True)),
+    ids=["resource tracker", "first process", "second process"],
+)
 def test_a_signal_while_child_processes_start(tmp_path: Path, turn: int, number: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", STARTING.format(turn=turn, number=int(number))],
@@ -244,19 +309,19 @@ import os, sys
 
 class Late:
     def __del__(self):
-        os.kill(os.getpid(), {number})
+        for number in {numbers!r}:
+            os.kill(os.getpid(), number)
 
 sys.modules["late"] = Late()  # freed when Python frees the modules, after its handlers
-sys.argv = ["skinnode", "hand", "new"]
+sys.argv = ["skinnode", "eds"]
 from skinnode.cli.main import main
 main()
 """
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-def test_one_while_python_frees_its_modules_does_not_matter(number: int) -> None:
+def test_one_while_python_frees_its_modules_does_not_matter() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", LATE.format(number=int(number))],
+        [sys.executable, "-c", LATE.format(numbers=[int(number) for number in SIGNALS])],
         capture_output=True,
         text=True,
         timeout=30,
@@ -280,11 +345,7 @@ def test_a_second_one_does_not_matter(folder: Path) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["skinnode", "hand", "check", "hand.toml"],
-        ["skinnode", "hand", "new"],
         ["skinnode", "eds"],
-        ["skinnode", "--help"],
-        ["skinnode", "conformance", "--list"],
         ["skinnode", "scan", *BUS, "--json"],
         ["skinnode", "record", "hand.toml", "-o", ".", "--listen"],
         ["vcan-sim", "hand.toml"],
@@ -299,6 +360,17 @@ def test_who_reads_may_go(folder: Path, arguments: list[str]) -> None:
         err = process.stderr.read()
         process.wait(timeout=30)
     assert (process.returncode, err) == (141, "")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["hand", "check", "hand.toml"], ["hand", "new"], ["--help"], ["conformance", "--list"]]
+)
+def test_who_reads_may_go_from_any_command(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    done = run_for_nobody(*arguments)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 @pytest.mark.parametrize("program", PROGRAMS.values())

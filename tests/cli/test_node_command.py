@@ -23,6 +23,8 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node.patch.find_source import GROUP, load, make_source
 from skinnode.transport import CanPort, Frame
 
+from ..commands import Output, run_here, run_until_signal
+
 ROOT = Path(__file__).parents[2]
 SKINNODE = str(Path(sys.executable).with_name("skinnode"))
 WAIT_S = 10.0
@@ -122,10 +124,7 @@ def master(multicast_group: str) -> Iterator[Master]:
         yield Master(port)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_of_the_users_own_source(
-    sources: Path, multicast_group: str, master: Master, number: signal.Signals
-) -> None:
+def test_a_node_of_the_users_own_source(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--layout", "aligned", "--serial", "77", "--json"]
     with running(multicast_group, *options, cwd=sources) as process:
         assert bytes(master.next(0x704).data) == b"\0"
@@ -142,7 +141,7 @@ def test_a_node_of_the_users_own_source(
         assert bytes(master.next(0x584).data)[4] == 0x81
         process.stdout.readline()  # what runs where
         process.stdout.readline()  # the first second
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (1, "")  # the source failed
     *seconds, fault = [json.loads(line) for line in out.splitlines()]
@@ -156,25 +155,27 @@ def test_a_node_of_the_users_own_source(
 
 def test_over_can_fd(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--fd", "--code-bits", "24", "--strict-timing"]
-    with running(multicast_group, *options, cwd=sources) as process:
+
+    def receive(_: Output) -> None:
         master.next(0x704)
         master.send(0x000, "01 04")
         master.send(0x080, "")
         chunks = [master.next(0x184) for _ in range(20)]
         assert {(frame.fd, len(frame.data)) for frame in chunks} == {(True, 64)}
         assert bytes(master.next(0x284).data)[2] == 20
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, "")
-    assert "10 × 30 wires, 24-bit codes" in out.splitlines()[0]
-    assert "CAN FD" in out.splitlines()[0]
+
+    done = run_until_signal(signal.SIGINT, *arguments(multicast_group, *options, node_id=4)[1:], when=receive)
+    assert (done.returncode, done.stderr) == (0, "")
+    head = done.stdout.splitlines()[0]
+    assert "10 × 30 wires, 24-bit codes" in head
+    assert "CAN FD" in head
 
 
 def test_ends_by_itself_and_says_how_it_does(sources: Path, multicast_group: str) -> None:
-    with running(multicast_group, "--source", "my_sources:Board", "--seconds", "1.2", cwd=sources) as process:
-        out, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (0, "")
-    head, *seconds = out.splitlines()
+    options = ["--source", "my_sources:Board", "--seconds", "1.2"]
+    done = run_here(*arguments(multicast_group, *options, node_id=4)[1:])
+    assert (done.returncode, done.stderr) == (0, "")
+    head, *seconds = done.stdout.splitlines()
     assert head.startswith("node 4 (10 × 30 wires, 16-bit codes, source my_sources:Board) on udp_multicast")
     assert [line.split("  ", 1)[1].strip() for line in seconds] == [
         "1.0 s  4  pre-operational  0 scans  1 frames",
@@ -186,18 +187,22 @@ def test_what_was_stored_is_there_at_the_next_start(
     sources: Path, multicast_group: str, master: Master
 ) -> None:
     options = ["--source", "my_sources:Board", "--store", "patch.json"]
-    for start in range(2):
-        with running(multicast_group, *options, cwd=sources) as process:
-            master.next(0x704)
-            master.send(0x604, "40 20 20 02 00 00 00 00")
-            assert bytes(master.next(0x584).data)[4] == (2, 99)[start]
-            if not start:
-                for request in ("2b 20 20 02 63 00 00 00", "23 10 10 01 73 61 76 65"):
-                    master.send(0x604, request)
-                    assert bytes(master.next(0x584).data)[0] == 0x60
-            process.send_signal(signal.SIGTERM)
-            _, err = process.communicate(timeout=20)
-            assert (process.returncode, err) == (0, "")
+
+    def at_the_first_start(_: Output) -> None:
+        ask_for(2)
+        for request in ("2b 20 20 02 63 00 00 00", "23 10 10 01 73 61 76 65"):
+            master.send(0x604, request)
+            assert bytes(master.next(0x584).data)[0] == 0x60
+
+    def ask_for(value: int) -> None:
+        master.next(0x704)
+        master.send(0x604, "40 20 20 02 00 00 00 00")
+        assert bytes(master.next(0x584).data)[4] == value
+
+    for when in (at_the_first_start, lambda _: ask_for(99)):
+        command = arguments(multicast_group, *options, node_id=4)[1:]
+        done = run_until_signal(signal.SIGTERM, *command, when=when)
+        assert (done.returncode, done.stderr) == (0, "")
     assert [file.name for file in sources.iterdir() if "patch.json" in file.name] == ["patch.json"]
 
 
@@ -213,9 +218,7 @@ def test_a_memory_that_is_of_no_use_is_a_fault(
 ) -> None:
     def run(*options: str) -> subprocess.CompletedProcess[str]:
         source = ["--source", "my_sources:Board", "--store", "patch.json", "--seconds", "0.2"]
-        command = arguments(multicast_group, *source, *options, node_id=4)
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+        return run_here(*arguments(multicast_group, *source, *options, node_id=4)[1:])
 
     if content is None:
         assert run("--code-bits", "24").returncode == 0
@@ -243,13 +246,7 @@ def test_two_processes_do_not_share_a_memory(sources: Path, multicast_group: str
 def test_a_memory_is_not_looked_for_behind_a_symbolic_link(sources: Path, multicast_group: str) -> None:
     (sources / "patch.json").symlink_to(sources / "elsewhere")
     options = ["--source", "my_sources:Board", "--store", "patch.json", "--seconds", "0.1"]
-    done = subprocess.run(
-        arguments(multicast_group, *options, node_id=4),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
+    done = run_here(*arguments(multicast_group, *options, node_id=4)[1:])
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: --store: got 'patch.json', allowed: a file, not a symbolic link\n"
 
@@ -294,14 +291,15 @@ def test_a_memory_is_a_regular_file_and_so_is_its_lock(sources: Path, kind: str,
 def test_another_node_with_the_same_node_id_is_a_fault(
     sources: Path, multicast_group: str, master: Master
 ) -> None:
-    with running(multicast_group, "--source", "my_sources:Board", cwd=sources) as process:
+    def interfere(_: Output) -> None:
         assert bytes(master.next(0x704).data) == b"\0"
         master.send(0x704, "00")
         assert bytes(master.next(0x084).data)[:2] == b"\x50\x81"
-        process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=20)
-        assert (process.returncode, err) == (1, "")
-        assert "fault: 1 boot-up or heartbeat from another node with this node-ID" in out
+
+    command = arguments(multicast_group, "--source", "my_sources:Board", node_id=4)[1:]
+    done = run_until_signal(signal.SIGTERM, *command, when=interfere)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert "fault: 1 boot-up or heartbeat from another node with this node-ID" in done.stdout
 
 
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:
@@ -335,9 +333,7 @@ def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -
     ],
 )
 def test_options_that_cannot_be(sources: Path, options: list[str], says: str) -> None:
-    command = [SKINNODE, "node", "--source", "my_sources:Board", "--interface", "virtual", *options]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    done = run_here("node", "--source", "my_sources:Board", "--interface", "virtual", *options)
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(says)
@@ -369,10 +365,9 @@ def test_a_source_that_is_none_is_one_line(sources: Path, name: str, says: str) 
 def test_a_bad_source_ends_with_status_2_before_a_frame_is_sent(
     sources: Path, multicast_group: str, master: Master
 ) -> None:
-    with running(multicast_group, "--source", "my_sources:dead", cwd=sources) as process:
-        out, err = process.communicate(timeout=30)
-    assert (process.returncode, out) == (2, "")
-    (line,) = err.splitlines()
+    done = run_here(*arguments(multicast_group, "--source", "my_sources:dead", node_id=4)[1:])
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
     assert line.startswith(
         "error: --source: got 'my_sources:dead', allowed: a source that returns readings ("
     )

@@ -24,6 +24,7 @@ from skinnode.host import Host
 from skinnode.process import clock
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
+from tests.commands import Output, run_until_signal
 from vcan_sim.commands.run import _too_slow
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
@@ -139,13 +140,12 @@ def heartbeats(bus: BusConfig) -> dict[int, int]:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -> None:
+def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig]) -> None:
     path, bus = shared
     with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path), "--json"]) as host:
         assert host.says('"elapsed_s"')
         assert eventually(lambda: sum('"elapsed_s"' in line for line in host.lines) >= 2)
-        assert host.end(number) == (0, ""), host.lines[-3:]
+        assert host.end(signal.SIGINT) == (0, ""), host.lines[-3:]
         last = json.loads([line for line in host.lines if "elapsed_s" in line][-1])
         assert set(last["patches"]) == {"thumb", "index"}
         for patch in last["patches"].values():
@@ -154,14 +154,14 @@ def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -
             assert patch["torn"] == patch["missed"] == patch["chunks_lost"] == 0
         assert json.loads(host.lines[-1]) == {"note": "nodes are pre-operational"}
         assert heartbeats(bus) == {11: 127, 12: 127}
-        status, errors = simulator.end(number)
+        status, errors = simulator.end(signal.SIGTERM)
         assert (status, errors) == (0, "")
 
 
 def test_host_that_is_killed_is_followed_by_another(shared: tuple[Path, BusConfig]) -> None:
     """The nodes go on without it; the next one takes them up."""
     path, bus = shared
-    with process([*SIMULATOR, str(path)]):
+    with Fleet(load_hand(path)):
         with process([*HOST, str(path)]) as killed:
             assert killed.says("thumb operational")
             killed.end(signal.SIGKILL)
@@ -173,39 +173,46 @@ def test_host_that_is_killed_is_followed_by_another(shared: tuple[Path, BusConfi
 
 def test_interrupted_while_it_waits_for_nodes(shared: tuple[Path, BusConfig]) -> None:
     path, bus = shared
-    with CanPort(bus) as listener, process([*HOST, str(path)]) as host:
-        while listener.recv(PATIENCE_S) is None:  # its first question
-            pass
-        assert host.end(signal.SIGINT) == (0, "")
+    with CanPort(bus) as listener:
+        done = run_until_signal(signal.SIGINT, "host", str(path), when=lambda _: listener.recv(PATIENCE_S))
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_wrong_length_is_one_line_and_status_2(shared: tuple[Path, BusConfig]) -> None:
     path, bus = shared
-    with process([*SIMULATOR, str(path)]), process([*HOST, str(path)]) as host:
-        assert host.says("operational on can0")
+
+    def disturb(said: Output) -> None:
+        assert said.has("operational on can0")
         with CanPort(bus) as stranger:
             stranger.send(0x18B, bytes(7))
-        assert eventually(lambda: sum(" s  can0" in line for line in host.lines) >= 2)
-        status, errors = host.end(signal.SIGINT)
+        assert said.has(" s  can0", 2)
+
+    with Fleet(load_hand(path)):
+        done = run_until_signal(signal.SIGINT, "host", str(path), when=disturb)
     line = "COB-ID 0x18B: got 7 bytes (00 00 00 00 00 00 00), allowed: 8 bytes (chunk)"
-    assert status == 2
+    assert done.returncode == 2
     rest = "further malformed frames with this COB-ID are counted but not logged"
-    assert errors.splitlines() == [f"can0: {line}; {rest}"]
-    assert host.lines[-1] == "nodes are pre-operational"
+    assert done.stderr.splitlines() == [f"can0: {line}; {rest}"]
+    assert done.stdout.splitlines()[-1] == "nodes are pre-operational"
 
 
 def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfig]) -> None:
     path, _ = shared
-    with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path)]) as host:
-        assert host.says("thumb operational")
-        simulator.end(signal.SIGKILL)
-        assert host.says("thumb lost (no heartbeat from node 11 for ")  # the reason, whatever the condition
-        status, errors = host.end(signal.SIGINT)
-    assert status == 1
+    with Fleet(load_hand(path)) as fleet:
+
+        def vanish(said: Output) -> None:
+            assert said.has("thumb operational")
+            fleet.inject(Faults(unplugged=True))
+            assert said.has(
+                "thumb lost (no heartbeat from node 11 for "
+            )  # the reason, whatever the condition
+
+        done = run_until_signal(signal.SIGINT, "host", str(path), when=vanish)
+    assert done.returncode == 1
     lost = {f"node {node} is lost: no heartbeat" for node in ("11 (thumb)", "12 (index)")}
-    assert set(errors.splitlines()) <= lost
+    assert set(done.stderr.splitlines()) <= lost
     for patch in ("thumb", "index"):
-        assert f"fault: {patch}: lost at the end" in host.lines
+        assert f"fault: {patch}: lost at the end" in done.stdout.splitlines()
 
 
 @pytest.mark.real_time

@@ -13,20 +13,23 @@ import pytest
 from skinnode.config import HandConfig
 from skinnode.host import Condition, Host
 from skinnode.record import Recorder, replay
+from tests.commands import run_here
 from vcan_sim.fleet import Fleet
 
 from .conftest import PATIENCE_S, PROGRAM, a_hand, write_hand
 
 
-def run(*arguments: str, program: list[str] = PROGRAM) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*program, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, stdin=subprocess.DEVNULL
-    )
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return run_here("monitor", *arguments)
 
 
 def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
+    """Of a process of its own, on a bus between processes."""
+    command = [*PROGRAM, str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "3"]
     with Fleet(crossing_hand):
-        done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "3")
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=PATIENCE_S, stdin=subprocess.DEVNULL
+        )
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(lines) == 3
@@ -38,10 +41,8 @@ def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
 
 
 @pytest.mark.parametrize("seconds", ["1", "3.2"])
-def test_json_of_a_hand_that_is_not_there_is_a_fault(
-    tmp_path: Path, crossing_hand: HandConfig, seconds: str
-) -> None:
-    done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", seconds)
+def test_json_of_a_hand_that_is_not_there_is_a_fault(tmp_path: Path, seconds: str) -> None:
+    done = run(str(write_hand(tmp_path, a_hand(2))), "--json", "--seconds", seconds)
     assert done.returncode == 1
     newest = json.loads(done.stdout.splitlines()[-1])
     assert {patch["condition"] for patch in newest["patches"].values()} == {"never seen"}
@@ -79,7 +80,7 @@ def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
     assert len(said) == 2
     assert said[0].startswith("fault: run.log line ")
     assert said[1].startswith("fault: run.log was not ended properly: readable up to ")
-    played = run(str(path), "--fast", program=[*PROGRAM[:-1], "replay"])
+    played = run_here("replay", str(path), "--fast")
     assert played.stdout.splitlines()[1:] == said
 
 
@@ -105,14 +106,15 @@ def test_what_cannot_run_is_one_line(arguments: list[str], said: str) -> None:
     assert said in done.stderr
 
 
-def test_without_textual_one_line_says_what_to_install() -> None:
-    code = "import sys; sys.modules['textual'] = None; from skinnode.cli.main import main; main()"
-    done = run("--simulate", program=[sys.executable, "-c", code, "monitor"])
+def test_without_textual_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "textual", None)
+    done = run("--simulate")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "sh install.sh tui" in done.stderr
 
 
+@pytest.mark.real_time
 def test_simulated_patches_are_a_hand_to_begin_with() -> None:
     done = run("--simulate", "--json", "--seconds", "2")
     newest = json.loads(done.stdout.splitlines()[-1])

@@ -17,7 +17,9 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from skinnode.config import HandConfig
+from skinnode.config.descriptions import descriptions_of
 from skinnode.config.explain import allowed_in, tables_in
+from skinnode.config.table import Table
 from vcan_sim.scenes import SceneConfig
 
 _TYPES: Final = {
@@ -55,12 +57,12 @@ def keys_of_a_scene() -> str:
     return "\n\n".join(_sections("", SceneConfig, listed=False))
 
 
-def _sections(path: str, model: type[BaseModel], *, listed: bool) -> list[str]:
+def _sections(path: str, model: type[Table], *, listed: bool) -> list[str]:
     title = "Top level" if not path else f"`[[{path}]]`" if listed else f"`[{path}]`"
-    rows, below = [], []
+    rows, below, descriptions = [], [], descriptions_of(model)
     for name, field in model.model_fields.items():
         inner = tables_in(field.annotation)
-        rows.append(_row(name, field))
+        rows.append(_row(name, field, descriptions.get(name)))
         if inner:
             key = f"{path}.{name}".strip(".")
             below += _sections(key, inner[0], listed=get_origin(field.annotation) is tuple)
@@ -69,9 +71,9 @@ def _sections(path: str, model: type[BaseModel], *, listed: bool) -> list[str]:
     return [f"## {title}\n\n{text}{md.table(head, rows)}", *below]
 
 
-def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
+def _row(name: str, field: FieldInfo, description: str | None) -> tuple[str, ...]:
     inner = tables_in(field.annotation)
-    about = md.prose(field.description or (inner[0].__doc__ if inner else "") or "")
+    about = md.prose(description or (inner[0].__doc__ if inner else "") or "")
     kind = _kind(field.annotation)
     allowed = allowed_in(field) or {"boolean": "true or false"}.get(kind, "")
     if inner:

@@ -45,7 +45,7 @@ _KERNELS: Final = (
     "solve/*.py",
     "solve/*/*.py",
     "solve/posterior/local/*.py",
-    "bus_load/stuffing.py",
+    "bus_load/stuffing*.py",
 )  # as in skinnode.compiled.jit
 _MEMORY_BYTES: Final = 8 << 30
 _FILE_BYTES: Final = 1 << 30

@@ -60,8 +60,8 @@ def resolve(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            help="Use the workers of this Dask scheduler. They need the same version of skinnode, and must see "
-            "the recordings and the output folder under the same paths.",
+            help="Use the workers of this Dask scheduler. They need the same version of skinnode, and must "
+            "see the recordings and the output folder under the same paths.",
             metavar="ADDRESS",
         ),
     ] = None,

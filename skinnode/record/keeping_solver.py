@@ -20,7 +20,8 @@ class KeepingSolver(ScanSolver):
         facts: Layout, code scale and baseline of the patch.
         hand: The hand.
         now: Function that returns the monotonic time, ns.
-        kept: Queue to which the resistances are appended, in the order of the fields; the caller removes them.
+        kept: Queue to which the resistances are appended, in the order of the fields; the caller removes
+            them.
     """
 
     def __init__(

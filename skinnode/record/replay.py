@@ -242,8 +242,8 @@ class Replay:
     def place(self) -> tuple[int, int]:
         """Current place in the recording, by which the fields are ordered.
 
-        The place consists of the number of frames read, and the number of buses whose last journal events have
-        been applied.
+        The place consists of the number of frames read, and the number of buses whose last journal events
+        have been applied.
         """
         return self._read, self._finished
 

@@ -52,7 +52,7 @@ class Cluster:
         self._futures: dict[Any, Unit] = {}
         self._gone_s = 0.0
         try:
-            self._client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+            self._client = Client(address, timeout=_CONNECT_S)
         except (OSError, ValueError, TimeoutError) as error:
             allowed = "the address of a running Dask scheduler, such as tcp://host:8786"
             raise ConfigError("--scheduler", address, f"{allowed} ({one_line_of(error)[:80]})") from None
@@ -119,7 +119,7 @@ class Cluster:
             raise SkinError(f"{unit}: {error}") from None
         except KilledWorker:
             raise SkinError(
-                f"{unit}: its worker ended {MOST_DEATHS} times; if memory is short, use fewer threads a worker"
+                f"{unit}: its worker ended {MOST_DEATHS} times; if memory is short, use fewer threads"
             ) from None
         except (FutureCancelledError, CommClosedError, TimeoutError):
             raise self._gone() from None

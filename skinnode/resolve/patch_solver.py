@@ -14,6 +14,7 @@ from skinnode.errors import SkinError
 from skinnode.host.containment import one_line
 from skinnode.model.frames import FieldFrame, ResistanceFrame
 from skinnode.model.layout import Float
+from skinnode.record.journal import facts_of
 from skinnode.record.keeping_solver import KeepingSolver
 from skinnode.resolve.scan_capture import CapturedFacts, CapturedScan, Place
 
@@ -40,9 +41,7 @@ class SolveSummary:
     std_sum_m: float = 0.0
     """Sum over the fields of the median standard deviation of z, m; unknown deviations are left out."""
     cpu_s: float = 0.0
-    """CPU time, s."""
-    complaints: tuple[str, ...] = ()
-    """Messages about facts with which no scan can be solved."""
+    """CPU time of solving, s."""
     rest_m: tuple[Float, ...] = ()
     """(U, N, 3) electrode positions at rest for each solver, m."""
 
@@ -55,7 +54,6 @@ class SolveSummary:
             max(self.deepest_m, other.deepest_m),
             self.std_sum_m + other.std_sum_m,
             self.cpu_s + other.cpu_s,
-            self.complaints + other.complaints,
         )
 
 
@@ -81,43 +79,39 @@ class PatchFields:
         """Yield each solved scan with the index of its electrode positions in :attr:`SolveSummary.rest_m`.
 
         Raises:
-            SkinError: Solving a scan raised an exception.
+            SkinError: The patch cannot be solved with these settings, or solving a scan raised an exception.
         """
-        start_s = time.thread_time()
         solver: KeepingSolver | None = None
         for item in self._captured:
             if isinstance(item, CapturedFacts):
                 solver = self._solver(item)
             elif solver is not None:
                 yield self._solved(solver, item), len(self._rest_m) - 1
-        self._summary = replace(self._summary, cpu_s=time.thread_time() - start_s)
 
     def summary(self) -> SolveSummary:
         """Return the summary; complete after the iteration."""
         return replace(self._summary, rest_m=tuple(self._rest_m))
 
-    def _solver(self, item: CapturedFacts) -> KeepingSolver | None:
-        facts = replace(item.facts, config=self._hand.patch(self._patch))
+    def _solver(self, item: CapturedFacts) -> KeepingSolver:
+        patch = self._hand.patch(self._patch)
+        facts = facts_of(item.facts, patch, self._hand.bus(patch.bus))
         try:
             solver = KeepingSolver(facts, self._hand, lambda: self._now_ns, self._kept)
-        except (KeyError, TypeError, OverflowError, ValueError) as error:  # as a replay reports it
-            text = f"unusable facts about {self._patch} ({type(error).__name__}: {error})"
-            self._summary = replace(self._summary, complaints=(*self._summary.complaints, text))
-            return None
+        except ValueError as error:
+            raise SkinError(f"cannot be solved with these settings ({error})") from error
         self._rest_m.append(facts.layout.upper_m)
         return solver
 
     def _solved(self, solver: KeepingSolver, item: CapturedScan) -> SolvedScan:
-        self._now_ns = item.now_ns
+        self._now_ns, start_s = item.now_ns, time.thread_time()
         try:
             field, _ = solver.solve(item.scan, item.stamp, item.verdict)
         except Exception as error:
-            where = f"patch {self._patch!r}, scan {item.stamp.scan}"
-            raise SkinError(f"{where}: {one_line(error)}") from error
-        self._count(field)
+            raise SkinError(f"scan {item.stamp.scan}: {one_line(error)}") from error
+        self._count(field, time.thread_time() - start_s)
         return SolvedScan(item.place, field, self._kept.popleft())
 
-    def _count(self, field: FieldFrame) -> None:
+    def _count(self, field: FieldFrame, cpu_s: float) -> None:
         std_m = float(np.median(field.displacement_std_m[..., 2]))
         self._summary += SolveSummary(
             1,
@@ -126,4 +120,5 @@ class PatchFields:
             len(field.contacts),
             float(-field.displacement_m[..., 2].min()),
             std_m if std_m < float("inf") else 0.0,
+            cpu_s,
         )

@@ -10,7 +10,6 @@ from typing import Final
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
-from skinnode.host.scan_solver import check_solvable
 from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.recording import Recording
 from skinnode.resolve.settings import Variant, apply, capture_hand, name_of
@@ -64,8 +63,6 @@ def make_plan(
     for recording, hand in recordings:
         for variant in variants:
             changed = apply(hand, variant)
-            for patch in changed.patches:
-                check_solvable(patch, changed.solver)
             name = file_name(recording.path.stem, variant if len(variants) > 1 else ())
             jobs.append(_job(recording, changed, variant, folder / f"{name}{suffix}", groups))
     targets = [job.write.target for job in jobs]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.model.status import Status
 from skinnode.protocol.scan import Scan
+from skinnode.record.journal import facts_table
 from skinnode.record.replay import Replay
 from skinnode.resolve.recording import Recording
 
@@ -24,14 +26,15 @@ Place = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class CapturedFacts:
-    """Facts with which a new solver solves the following scans of a patch."""
+    """Facts with which a new solver solves the following scans of a patch.
 
-    facts: NodeFacts
+    The facts are stored as in a journal. When rebuilt, patches with the same layout share its tables.
+    """
 
-    @property
-    def patch(self) -> str:
-        """Name of the patch."""
-        return self.facts.config.name
+    patch: str
+    """Name of the patch."""
+    facts: dict[str, Any]
+    """Result of :func:`~skinnode.record.journal.facts_table`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +110,7 @@ class Capture:
         return kept
 
     def _solver(self, facts: NodeFacts, hand: HandConfig, now: Callable[[], int]) -> ScanSolver:
-        self._kept.append(CapturedFacts(facts))
+        self._kept.append(CapturedFacts(facts.config.name, facts_table(facts)))
         return _CapturingSolver(facts, self._keep)
 
     def _keep(self, scan: Scan, stamp: ScanStamp, verdict: Verdict) -> None:

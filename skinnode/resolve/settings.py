@@ -14,7 +14,10 @@ from skinnode.errors import ConfigError
 _PATCH_KEYS: Final = ("relative_noise", "calibration", "tolerances", "layout")
 """Keys of a patch that describe its skin, not its identity on the bus."""
 _EVERY_PATCH: Final = "*"
-_ALLOWED: Final = f"solver.KEY, or patches.NAME.KEY with a patch's name or * for all, and a key below {', '.join(_PATCH_KEYS)}"
+_ALLOWED: Final = (
+    "solver.KEY, or patches.NAME.KEY, where NAME is a patch or * for all, "
+    f"and KEY is {', '.join(_PATCH_KEYS[:-1])} or {_PATCH_KEYS[-1]}, or a key of one of these tables"
+)
 _WITHOUT_LIMIT: Final = "no time limit, because the results would depend on the speed of the computer"
 _LIVE: Final = {"deadline_us": _WITHOUT_LIMIT, "workers": "--processes instead"}
 """Keys of the solver that only a live host uses."""
@@ -147,7 +150,7 @@ def _split(text: str) -> list[str]:
 
 
 def capture_hand(hand: HandConfig) -> HandConfig:
-    """Return the hand without the settings that only the solver uses, so that variants can share the scans."""
+    """Return the hand without the settings of the solver; variants with the same result share the scans."""
     plain = PatchConfig(name="any", node_id=1)
     same = {"calibration": plain.calibration, "tolerances": plain.tolerances}
     patches = tuple(patch.model_copy(update=same) for patch in hand.patches)

@@ -57,7 +57,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class CaptureScans(Unit):
-    """Unit that assembles the scans of some buses. Its part has the summary; each patch has a part of its own.
+    """Unit that assembles the scans of some buses. Its part has the summary; each patch has its own part.
 
     Attributes:
         buses: Names of the buses.
@@ -67,6 +67,7 @@ class CaptureScans(Unit):
 
     @property
     def details(self) -> tuple[str, ...]:
+        """Names of the buses."""
         return self.buses
 
     def run(self, parts: PartFiles) -> None:
@@ -102,10 +103,12 @@ class SolvePatch(Unit):
 
     @property
     def needs(self) -> tuple[str, ...]:
+        """Key of the unit that captures the scans."""
         return (self.capture.key,)
 
     @property
     def details(self) -> tuple[str, ...]:
+        """Name of the patch."""
         return (self.patch,)
 
     def __str__(self) -> str:
@@ -149,10 +152,12 @@ class WriteResult(Unit):
 
     @property
     def needs(self) -> tuple[str, ...]:
+        """Keys of the units that capture and solve the scans."""
         return (*self.captured, *self.solved)
 
     @property
     def details(self) -> tuple[str, ...]:
+        """The file, and the keys of the solved patches."""
         return (str(self.target), *self.solved)
 
     def run(self, parts: PartFiles) -> None:
@@ -167,7 +172,7 @@ class WriteResult(Unit):
         flaws = dict.fromkeys(text for each in captures for text in each.flaws)  # each read all frames
         losses = [text for each in captures for text in each.losses]
         notes = dict.fromkeys(text for each in captures for text in each.notes)
-        return ResultSummary(sums, (*flaws, *losses, *sums.complaints), tuple(notes))
+        return ResultSummary(sums, (*flaws, *losses), tuple(notes))
 
 
 def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> str:

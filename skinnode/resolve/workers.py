@@ -19,7 +19,7 @@ class Workers(Protocol):
         """Run a unit as soon as a worker is free."""
 
     def finished(self, timeout_s: float) -> Sequence[str]:
-        """Wait until a unit is finished, for at most ``timeout_s`` seconds; return the keys of finished units.
+        """Wait for finished units, for at most ``timeout_s`` seconds, and return their keys.
 
         Raises:
             SkinError: A unit or all workers failed.

@@ -20,7 +20,7 @@ from skinnode.model.frames import FieldFrame, ResistanceFrame
 from skinnode.model.layout import Float
 from skinnode.record.copy_mcap import copy_mcap
 from skinnode.record.field_rows import FieldRow, row_of
-from skinnode.record.journal import SUFFIX
+from skinnode.record.journal import journal_of, new_journal_of
 from skinnode.record.keeping_solver import KeepingSolver
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import MCAP, McapFile
@@ -107,7 +107,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
         raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
     taken = [target]
     if target.suffix in WRITABLE and not _share_journal(source, target):
-        taken.append(target.with_suffix(SUFFIX))
+        taken.append(new_journal_of(target))
     for path in taken:
         if path.exists():
             raise ConfigError("target", str(path), "a new file; this one exists and is not overwritten")
@@ -118,9 +118,8 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
 
 def _share_journal(source: Path, target: Path) -> bool:
     """Return whether both files are logs with the same name in the same folder and so share a journal."""
-    return {source.suffix, target.suffix} <= set(WRITABLE) and source.with_suffix("") == target.with_suffix(
-        ""
-    )
+    both_logs = {source.suffix, target.suffix} <= set(WRITABLE)
+    return both_logs and journal_of(source) == journal_of(target)
 
 
 def _ending_in(suffixes: tuple[str, ...]) -> str:

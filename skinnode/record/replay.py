@@ -119,15 +119,19 @@ class Replay:
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = recording.frames
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
-        ends = [event for event in events if event["event"] == "ended"]
+        repairs = [event for event in events if event["event"] == "repaired"]
+        ends = [event for event in events if event["event"] == "ended"] or repairs
         self.ended = bool(ends)
-        """Whether the recording was closed properly; False if its process was killed."""
+        """Whether the recording was closed properly or has been repaired; False if its process was killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
+        self._lacking = any(event["damaged"] for event in repairs)  # frames before the end
         self._read = 0
         self._first_ns: int | None = None
         self._journal = recording.journal
-        self.notes = recording.notes
-        """Assumptions that were made because the log has no journal."""
+        name = recording.frames.path.name
+        repaired = [f"{name} was repaired; it contains the readable part of a recording"] if repairs else []
+        self.notes = (*recording.notes, *repaired)
+        """Messages about a repair, and about assumptions that were made because the log has no journal."""
         self.incomplete: str | None = None
         """Description of the frames missing from the log; None if none are known to be missing."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
@@ -156,7 +160,9 @@ class Replay:
                 continue
             if name not in self._buses:
                 continue
-            self._buses[name].take(frame, sent=sent, whole=not (self.log.damaged or self.foreign))
+            self._buses[name].take(
+                frame, sent=sent, whole=not (self.log.damaged or self.foreign or self._lacking)
+            )
             while (field := fields.get(0.0)) is not None:
                 yield field
         for number, bus in enumerate(self.hand.buses, 1):

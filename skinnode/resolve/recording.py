@@ -7,7 +7,7 @@ from pathlib import Path
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError, SkinError
-from skinnode.record.journal import SUFFIX, Header
+from skinnode.record.journal import Header, journal_of
 from skinnode.record.mcap_file import MCAP
 from skinnode.record.sources import OpenRecording, open_log, open_recording
 
@@ -64,7 +64,7 @@ def recording_at(path: Path, hand: HandConfig | None) -> tuple[Recording, HandCo
 
 
 def _state(path: Path, *, foreign: bool) -> tuple[tuple[int, int], ...]:
-    files = [path] if foreign or path.suffix == MCAP else [path, path.with_suffix(SUFFIX)]
+    files = [path] if foreign or path.suffix == MCAP else [path, journal_of(path)]
     try:
         return tuple((file.stat().st_size, file.stat().st_mtime_ns) for file in files)
     except OSError as error:

@@ -99,7 +99,7 @@ def _write_mcap(
 
     try:
         for _ in run.frames():
-            write_until((run.place[0] - 1, 0))
+            write_until(run.place)
         write_until((run.place[0], len(hand.buses)))
     finally:
         file.close()

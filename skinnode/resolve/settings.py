@@ -120,7 +120,7 @@ def _set(table: Any, path: list[str | int], setting: Setting) -> None:
             table = table[part]
             continue
         table = table.setdefault(part, {})
-        if not isinstance(table, (dict, list)):
+        if not isinstance(table, dict | list | tuple):
             raise ConfigError("--set", setting.key, f"{part} itself, which is no table here")
     table[path[-1]] = setting.value
 

@@ -94,11 +94,16 @@ class Cluster:
     def finished(self, timeout_s: float) -> Sequence[str]:
         """Wait for finished units; see :meth:`Workers.finished`."""
         from distributed import wait
+        from distributed.client import FuturesCancelledError
 
         if not self._futures:
             return []
-        with suppress(TimeoutError):
+        try:
             wait(list(self._futures), timeout=timeout_s, return_when="FIRST_COMPLETED")
+        except TimeoutError:
+            pass
+        except FuturesCancelledError:
+            raise self._gone() from None
         self._require_connection(timeout_s)
         done = [future for future in self._futures if future.done()]
         return [self._result(future, self._futures.pop(future)) for future in done]
@@ -110,7 +115,7 @@ class Cluster:
 
     def _result(self, future: Any, unit: Unit) -> str:
         from distributed.client import FutureCancelledError
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
         try:

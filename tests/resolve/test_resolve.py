@@ -28,7 +28,6 @@ from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.plan import make_plan
 from skinnode.resolve.recording import recording_at
 from skinnode.resolve.run import WORK_FOLDER, run, work_folder
-from skinnode.resolve.units import SolvePatch
 
 
 def resolve(*arguments: object, status: int = 0) -> Any:
@@ -142,7 +141,7 @@ def job_of(recording: Path, folder: Path, count: int = 2) -> Any:
 def test_processes_that_are_killed_change_nothing(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every unit but those that have already been lost twice is killed in its middle."""
+    """Two of them, while they work."""
     wanted = tmp_path / "wanted.parquet"
     convert(recording, wanted)
     started: list[processes.SpawnProcess] = []
@@ -169,20 +168,20 @@ def test_processes_that_are_killed_change_nothing(
     assert summary.sums.fields == len(list(replay(recording)))
 
 
-def test_a_unit_that_kills_every_process_is_named(recording: Path, tmp_path: Path) -> None:
-    with work_folder(tmp_path / "out") as folder, processes.Processes(1, folder) as workers:
-        unit = SolvePatch(*recording_at(recording, None), "p2", job_of(recording, tmp_path).captures[0])
-        for _ in range(3):
-            workers._children = []
-            workers._waiting.append(unit)
-            workers._hand_out()
-            workers._children[0].process.kill()
-            if _ < 2:
-                workers.finished(20.0)
-                workers._waiting.clear()
-                workers.close()
-        with pytest.raises(SkinError, match=r"run\.log, patch p2: its process ended 3 times .*--processes"):
-            workers.finished(20.0)
+def test_a_unit_that_kills_every_process_is_named(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = processes.Processes._start
+
+    def killed(self: processes.Processes) -> Any:
+        child = start(self)
+        child.process.kill()
+        return child
+
+    monkeypatch.setattr(processes.Processes, "_start", killed)
+    named = pytest.raises(SkinError, match=r"run\.log: its process ended 3 times \(.*-9\); .*--processes")
+    with work_folder(tmp_path) as folder, processes.Processes(1, folder) as workers, named:
+        run([job_of(recording, tmp_path, 1)], workers, PartFiles(folder), lambda *_: None)
 
 
 COMMAND = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "resolve"]

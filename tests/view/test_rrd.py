@@ -203,9 +203,7 @@ def test_the_command_converts_a_recording(recording: Path, tmp_path: Path, sdk: 
     assert len(Rows(path).of) == len(rows.of)  # and is as it was
 
 
-def test_convert_draws_as_view_does_unless_told_otherwise(
-    recording: Path, tmp_path: Path, sdk: None
-) -> None:
+def test_convert_draws_as_view_does_unless_told_otherwise(recording: Path, tmp_path: Path, sdk: None) -> None:
     drawn, converted = tmp_path / "drawn.rrd", tmp_path / "converted.rrd"
     view("--replay", str(recording), "--save", str(drawn))
     code = "from skinnode.cli.main import main; main()"

@@ -159,11 +159,12 @@ def test_processes_that_are_killed_change_nothing(
         def kill(done: int, total: int, newest: str) -> None:
             nonlocal killed
             if done in (1, 3):
-                started[-1].kill()
+                next(child for child in workers._children if child.unit is not None).process.kill()
                 killed += 1
 
         (summary,) = run([job_of(recording, tmp_path)], workers, PartFiles(folder), kill)
-    assert (killed, len(started)) == (2, 4)
+    assert killed == 2
+    assert len(started) > 2  # others have taken their place
     assert (tmp_path / "run.parquet").read_bytes() == wanted.read_bytes()
     assert summary.sums.fields == len(list(replay(recording)))
 

@@ -23,6 +23,7 @@ from skinnode.cli import (
     od,
     record,
     replay,
+    resolve,
     scan,
     tare,
     view,
@@ -53,6 +54,7 @@ app.command(name="doctor")(doctor.doctor)
 app.command(name="record")(record.record)
 app.command(name="replay")(replay.replay)
 app.command(name="convert")(convert.convert)
+app.command(name="resolve")(resolve.resolve)
 app.command(name="conformance")(conformance.conformance)
 app.add_typer(bench.app, name="bench")
 

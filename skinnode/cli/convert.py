@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from skinnode.text.words import counted
+
+if TYPE_CHECKING:
+    from skinnode.config import HandConfig
+    from skinnode.record.convert import Conversion
+
+_RRD = ".rrd"
+_EXAGGERATION = 10.0
+"""Factor by which displacements are drawn enlarged, as in ``skinnode view``."""
 
 
 def convert(
@@ -41,15 +49,20 @@ def convert(
     """Convert a recording to another format, or to a table of its fields and resistances.
 
     Formats with frames: .mcap (MCAP for ROS 2), .log (candump), .blf and .asc (Vector). Field tables:
-    .parquet and .npz. The fields are the same as those computed by `skinnode replay`. A note lists the data
-    that the target cannot contain. To repair a damaged MCAP file, convert it to a new MCAP file.
+    .parquet and .npz. Three-dimensional view: .rrd (Rerun). The fields are the same as those computed by
+    `skinnode replay`. A note lists the data that the target cannot contain. To repair a damaged MCAP file,
+    convert it to a new MCAP file.
 
     The exit status is 1 if the source is damaged or incomplete, and 2 if it could not be converted.
     """
     from skinnode.config import load_hand
     from skinnode.record.convert import convert as run
 
-    done = run(source, target, hand=None if hand is None else load_hand(hand), frames_only=frames_only)
+    plan = None if hand is None else load_hand(hand)
+    if target.suffix == _RRD:
+        done = _draw(source, target, plan)
+    else:
+        done = run(source, target, hand=plan, frames_only=frames_only)
     if as_json:
         facts = {"target": str(target), "frames": done.frames, "fields": done.fields}
         print(json.dumps({**facts, "notes": done.notes, "faults": done.faults}))
@@ -64,3 +77,24 @@ def convert(
             print(f"fault: {fault}")
     if done.faults:
         raise typer.Exit(1)
+
+
+def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
+    """Draw a recording to a file of Rerun."""
+    from skinnode.errors import ConfigError
+    from skinnode.record.convert import Conversion
+    from skinnode.view.file_conversion import convert_to_file
+    from skinnode.view.viewer_process import require_viewer
+
+    require_viewer()
+    if target.exists():
+        raise ConfigError("target", str(target), "a new file; this one exists and is not overwritten")
+    if not target.parent.is_dir():
+        raise ConfigError("target", str(target), "a file in an existing folder")
+    try:
+        done = convert_to_file(source, target, exaggeration=_EXAGGERATION, hand=hand)
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
+    lost = f"{target.name} cannot contain frames and the journal; a recording cannot be made from it again"
+    return Conversion(0, done.counts.drawn, tuple(done.replay.flaws), (*done.replay.notes, lost))

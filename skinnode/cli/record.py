@@ -95,6 +95,12 @@ def _run(
             with followed(recorder, running), running.fields(capacity=1) as fields:
                 _follow(recorder, stop, seconds, as_json, lambda: fields.get(0.0))
             faults, notes = faults_and_notes(running)
+            skipped = {name: stream.skipped for name, stream in running.stats().patches.items()}
+            notes += [
+                f"{name}: {counted(count, 'scan')} skipped for newer ones; their frames were recorded"
+                for name, count in skipped.items()
+                if count
+            ]
             for note in notes:
                 _say(as_json, note=f"note: {note}")
             return faults

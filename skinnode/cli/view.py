@@ -121,7 +121,7 @@ def view(
     with stop_on_signal() as stop, ExitStack() as stack:
         try:
             if replay is not None and save is not None and speed is None and not web:
-                faults, counts = _convert(stack, replay, options, stop, exaggerate)
+                faults, counts = _convert(replay, Path(save), stop, exaggerate)
             else:
                 if replay is not None:
                     shown = _replaying(stack, replay, 1.0 if speed is None else speed, drawing)
@@ -235,28 +235,15 @@ def _viewer_ended(viewer: ViewerProcess) -> SkinError:
 
 
 def _convert(
-    stack: ExitStack, path: Path, options: OutputOptions, stop: threading.Event, exaggeration: float
+    path: Path, save: Path, stop: threading.Event, exaggeration: float
 ) -> tuple[list[str], DrawnCounts]:
     """Write a whole recording to a file; return its faults and the field counts."""
-    from skinnode.view.conversion import Conversion
-    from skinnode.view.drawing import HandDrawing
+    from skinnode.view.file_conversion import convert_to_file
     from skinnode.view.outputs import require_new_file
-    from skinnode.view.stream import open_stream
 
-    if options.save is not None:
-        require_new_file(options.save)
-    conversion = Conversion(path, stop.is_set)
-    stack.callback(conversion.replay.log.close)
-    output = _open(stack, options)
-    drawing = HandDrawing(
-        stack.enter_context(open_stream(output.target(path.name))),
-        conversion.replay.hand,
-        exaggeration=exaggeration,
-        wall_minus_mono_ns=conversion.replay.wall_minus_mono_ns,
-        live=False,
-    )
-    conversion.run(drawing.draw)
-    return [*conversion.faults.lines, *conversion.replay.flaws], conversion.counts
+    require_new_file(save)
+    done = convert_to_file(path, save, exaggeration=exaggeration, cancelled=stop.is_set)
+    return [*done.faults.lines, *done.replay.flaws], done.counts
 
 
 def _report(faults: list[str], counts: DrawnCounts) -> None:

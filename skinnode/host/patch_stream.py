@@ -343,8 +343,7 @@ class PatchStream:
             return
         self._solving = stamp.scan
         try:
-            field, invalid = solver.solve(verdict.admitted(scan), stamp)
-            field = verdict.applied(field)
+            field, invalid = solver.solve(scan, stamp, verdict)
         except Exception:
             self._failed += 1
             raise

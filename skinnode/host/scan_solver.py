@@ -8,6 +8,7 @@ import numpy as np
 
 from skinnode.config import PatchConfig, SolverConfig
 from skinnode.errors import ConfigError
+from skinnode.host.code_watch import FAULTLESS, Verdict
 from skinnode.host.node_facts import NodeFacts
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
@@ -70,16 +71,22 @@ class ScanSolver:
             resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
-    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+    def solve(self, scan: Scan, stamp: ScanStamp, verdict: Verdict = FAULTLESS) -> tuple[FieldFrame, int]:
         """Solve a scan, allowing for converter noise and for the quantization error of the codes.
+
+        Args:
+            scan: The scan.
+            stamp: Its number and times.
+            verdict: Result of checking the codes of the scan.
 
         Returns:
             Stamped field with read-only arrays, and the number of codes that are not measurements.
         """
         self._tracker.scan = stamp.scan
-        field, invalid = self._tracker.update_codes(scan.codes)
+        field, invalid = self._tracker.update_codes(verdict.admitted(scan).codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
-        return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._now())), invalid
+        field = sealed(field, contacts=contacts, stamp=stamp.solved_at(self._now()))
+        return verdict.applied(field), invalid
 
 
 def tracker_options(

@@ -7,6 +7,7 @@ and poses, which a replay computes. A field table contains the results of a repl
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,10 +16,12 @@ from typing import Final, Protocol
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
-from skinnode.model.frames import FieldFrame
+from skinnode.model.frames import FieldFrame, ResistanceFrame
+from skinnode.model.layout import Float
 from skinnode.record.copy_mcap import copy_mcap
 from skinnode.record.field_rows import FieldRow, row_of
-from skinnode.record.journal import SUFFIX
+from skinnode.record.journal import journal_of, new_journal_of
+from skinnode.record.keeping_solver import KeepingSolver
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import MCAP, McapFile
 from skinnode.record.npz_file import NpzFile, read_npz
@@ -104,7 +107,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
         raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
     taken = [target]
     if target.suffix in WRITABLE and not _share_journal(source, target):
-        taken.append(target.with_suffix(SUFFIX))
+        taken.append(new_journal_of(target))
     for path in taken:
         if path.exists():
             raise ConfigError("target", str(path), "a new file; this one exists and is not overwritten")
@@ -115,9 +118,8 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
 
 def _share_journal(source: Path, target: Path) -> bool:
     """Return whether both files are logs with the same name in the same folder and so share a journal."""
-    return {source.suffix, target.suffix} <= set(WRITABLE) and source.with_suffix("") == target.with_suffix(
-        ""
-    )
+    both_logs = {source.suffix, target.suffix} <= set(WRITABLE)
+    return both_logs and journal_of(source) == journal_of(target)
 
 
 def _ending_in(suffixes: tuple[str, ...]) -> str:
@@ -139,17 +141,16 @@ def _copy_table(source: Path, target: Path) -> Conversion:
 
 
 def _tabulate(recording: OpenRecording, target: Path) -> Conversion:
-    run = Replay(recording, keep_resistances=True)
-    fields = _write_table(target, recording.lines[0] if recording.lines else "", _rows(run))
+    kept: deque[ResistanceFrame] = deque()
+    run = Replay(recording, solver=lambda facts, hand, now: KeepingSolver(facts, hand, now, kept))
+    fields = _write_table(target, recording.lines[0] if recording.lines else "", _rows(run, kept))
     lost = "frames, journal, health and events; a recording cannot be made from it again"
     if target.suffix == NPZ:
         lost = f"contacts, faults, {lost}"
     return Conversion(0, fields, tuple(run.flaws), (*run.notes, f"{target.name} cannot contain {lost}"))
 
 
-def _rows(run: Replay) -> Iterator[FieldRow]:
-    kept = run.resistances
-    assert kept is not None
+def _rows(run: Replay, kept: deque[ResistanceFrame]) -> Iterator[FieldRow]:
     for field in run:
         yield row_of(field, kept.popleft(), run.wall_minus_mono_ns)
 
@@ -180,16 +181,13 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
             journal=not (recording.foreign or _share_journal(recording.frames.path, target)),
         )
     )
-    offset_ns = recording.header.wall_minus_mono_ns
-    for number, line in enumerate(recording.lines):
-        at_ns = recording.events[0]["t_ns"] if recording.events and number else 0
-        file.write_line(line, at_ns + offset_ns)
-    file.flush_journal()
-    tee = _Tee(recording, file)
+    tee = CopiedFrames(recording, file)
     run = Replay(replace(recording, frames=tee))
     if fields and isinstance(file, McapFile):
         for field in run:
-            _write_field(file, run, field)
+            assert field.stamp is not None
+            rest_m = run.layout(field.stamp.patch).upper_m
+            write_computed_field(file, field, rest_m, run.wall_minus_mono_ns)
     else:
         for _ in run.frames():
             pass
@@ -198,17 +196,33 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
     return Conversion(file.frames, written, tuple(run.flaws), (*run.notes, *_losses(recording, target, tee)))
 
 
-def _write_field(file: McapFile, run: Replay, field: FieldFrame) -> None:
-    stamp = field.stamp
-    assert stamp is not None
-    log_ns = stamp.t_receive_ns + run.wall_minus_mono_ns
-    file.write_field(field, run.layout(stamp.patch).upper_m, run.wall_minus_mono_ns, log_ns)
+def write_computed_field(file: McapFile, field: FieldFrame, rest_m: Float, offset_ns: int) -> None:
+    """Write a field that was computed from a recording; the log time is the time of the scan's last frame.
+
+    Args:
+        file: The file.
+        field: The field, with a stamp.
+        rest_m: (U, N, 3) electrode positions at rest, m.
+        offset_ns: Time since 1970 minus time on the stamp's clock, ns.
+    """
+    assert field.stamp is not None
+    file.write_field(field, rest_m, offset_ns, field.stamp.t_receive_ns + offset_ns)
 
 
-class _Tee:
-    """Writes a recording's frames to a file while they are read."""
+class CopiedFrames:
+    """Frames of a recording, each written to a file when it is read.
+
+    Args:
+        recording: The recording, whose journal is written to the file at once.
+        file: The file.
+    """
 
     def __init__(self, recording: OpenRecording, file: LogFiles | McapFile) -> None:
+        offset_ns = recording.header.wall_minus_mono_ns
+        for number, line in enumerate(recording.lines):
+            at_ns = recording.events[0]["t_ns"] if recording.events and number else 0
+            file.write_line(line, at_ns + offset_ns)
+        file.flush_journal()
         self._frames, self._file, self._channels = recording.frames, file, recording.channels
         self.path = recording.frames.path
         self.errors = 0
@@ -236,7 +250,7 @@ class _Tee:
         self._frames.close()
 
 
-def _losses(recording: OpenRecording, target: Path, tee: _Tee) -> list[str]:
+def _losses(recording: OpenRecording, target: Path, tee: CopiedFrames) -> list[str]:
     """Describe, in at most one line, the data that the target cannot contain."""
     lost = []
     from_mcap = recording.frames.path.suffix == MCAP

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from skinnode.messages.definitions import CAN_FRAME, FD_FRAME
+from skinnode.messages.definitions import CAN_FRAME, FD_FRAME, JOURNAL_LINE
 from skinnode.messages.fields import POINT_CLOUD
-from skinnode.messages.typestore import require_mcap
+from skinnode.messages.typestore import decode, encode, message_type, require_mcap
 from skinnode.record.mcap_file import CHUNK_BYTES, PROFILE
 from skinnode.transport.frame_log import create_binary
+
+if TYPE_CHECKING:
+    from mcap.records import Message
+    from mcap.writer import Writer
 
 
 def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
     """Copy every readable message, with its times, topic and schema.
+
+    If the source is a recording that was not ended properly or is damaged, the journal of the copy says so.
 
     Returns:
         Numbers of CAN frames and fields copied, and a one-line message for each damaged part.
@@ -23,7 +32,7 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
     require_mcap(str(source))
     from mcap.writer import CompressionType, Writer
 
-    from skinnode.record.mcap_chunks import McapChunks
+    from skinnode.record.mcap_chunks import TRUNCATED, McapChunks
 
     chunks = McapChunks(source, lambda schema: None)
     counts: dict[str, int] = {}
@@ -32,6 +41,8 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
         writer.start(profile=PROFILE, library="skinnode")
         schemas: dict[int, int] = {}
         channels: dict[int, int] = {}
+        last: tuple[int, Message] | None = None  # newest journal line, with its channel in the copy
+        ended = False
         for item in chunks.messages(None):
             channel, message, schema = item.channel, item.message, item.schema
             if channel.id not in channels:
@@ -46,9 +57,30 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
             )
             name = "" if schema is None else schema.name
             counts[name] = counts.get(name, 0) + 1
+            if name == JOURNAL_LINE:
+                last = (channels[channel.id], message)
+                ended = ended or _ends(message.data)
+        inside = sum(damage.what != TRUNCATED for damage in chunks.damages)
+        if last is not None and (inside or not ended):
+            frames = counts.get(CAN_FRAME, 0) + counts.get(FD_FRAME, 0)
+            _add_repaired(writer, *last, frames=frames, damaged=inside)
         writer.finish()
     faults = [f"{source.name} {damage}" for damage in chunks.damages]
     if chunks.damaged > len(faults):
         faults.append(f"{chunks.damaged - len(faults)} more damaged places")
     frames = counts.get(CAN_FRAME, 0) + counts.get(FD_FRAME, 0)
     return frames, counts.get(POINT_CLOUD, 0), faults
+
+
+def _ends(data: bytes) -> bool:
+    """Return whether a journal line says that the recording was ended properly or has been repaired."""
+    with suppress(ValueError, TypeError, KeyError, RecursionError):
+        return json.loads(decode(data, JOURNAL_LINE).json)["event"] in ("ended", "repaired")
+    return False
+
+
+def _add_repaired(writer: Writer, channel: int, last: Message, *, frames: int, damaged: int) -> None:
+    """Write the journal line of a repaired recording; ``last`` is the line before it."""
+    event = {"bus": "", "at": 0, "t_ns": 0, "event": "repaired", "frames": frames, "damaged": damaged}
+    data = encode(message_type(JOURNAL_LINE)(json.dumps(event)), JOURNAL_LINE)
+    writer.add_message(channel, last.log_time, data, last.publish_time, (last.sequence + 1) & 0xFFFF_FFFF)

@@ -26,6 +26,9 @@ _POLL_S: Final = 0.2
 def followed(recorder: Recorder, host: Host) -> Iterator[None]:
     """Record the fields, contacts, health and events of ``host`` while the ``with`` block is active.
 
+    If the host closes afterwards, the fields of the scans that end while it closes are recorded too, so the
+    recording contains the same fields as its replay.
+
     Has no effect if the recording is not an MCAP file. If the disk is slow, the recorder drops the oldest
     queued fields and counts them in ``RecorderStats.fields_dropped``; the host is not delayed.
 
@@ -36,7 +39,8 @@ def followed(recorder: Recorder, host: Host) -> Iterator[None]:
     if not recorder.records_fields:
         yield
         return
-    callback = host.on_field(recorder.field, capacity=CAPACITY_FIELDS)
+    callback = host.on_field(recorder.field, capacity=CAPACITY_FIELDS)  # ends when the host closes
+    recorder.count_lost_fields(lambda: callback.dropped + callback.failed)
     events, over = host.events(), clock.event()
     watcher = clock.thread(target=lambda: _watch(recorder, host, events, over), name="record health")
     watcher.start()
@@ -45,8 +49,6 @@ def followed(recorder: Recorder, host: Host) -> Iterator[None]:
     finally:
         over.set()
         watcher.join()
-        callback.close()
-        recorder.lose_fields(callback.dropped + callback.failed)
 
 
 def _watch(recorder: Recorder, host: Host, events: EventSubscription, over: threading.Event) -> None:

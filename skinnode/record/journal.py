@@ -15,6 +15,8 @@ the event, and ``t_ns`` its time on the host's monotonic clock.
 ``polled``     a timeout ended a scan that lacked frames
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
 ``dropped``    ``frames`` were not written, because the disk was too slow
+``repaired``   the file is a copy of the readable part of a recording, with ``frames`` frames; ``damaged``
+               counts the unreadable parts before the end
 ``ended``      the recording was closed with ``frames`` in the log; if this event is missing, the process was
                killed or the disk was full
 =============  ==============================================================================
@@ -36,9 +38,28 @@ from skinnode.host.node_facts import NodeFacts
 from skinnode.model.layout import PatchLayout
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
+from skinnode.transport.frame_log import WRITABLE
 
 FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
+
+
+def journal_of(log: Path) -> Path:
+    """Return the path of a log's journal: ``run.log.jsonl`` if it exists, otherwise ``run.jsonl``."""
+    own = log.with_name(log.name + SUFFIX)
+    return own if own.exists() else log.with_suffix(SUFFIX)
+
+
+def new_journal_of(log: Path) -> Path:
+    """Return the path of a new log's journal.
+
+    The journal of ``run.blf`` is ``run.jsonl`` or, if another log such as ``run.log`` uses that name,
+    ``run.blf.jsonl``.
+    """
+    others = [log.with_suffix(suffix) for suffix in WRITABLE if suffix != log.suffix]
+    taken = log.with_suffix(SUFFIX).exists() and any(other.exists() for other in others)
+    return log.with_name(log.name + SUFFIX) if taken else log.with_suffix(SUFFIX)
+
 
 COMPLAINTS_KEPT: Final = 100
 """Maximum number of unreadable lines reported one by one; any more are only counted."""
@@ -225,6 +246,9 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
             _whole(event["frames"])
         case "ended":
             _whole(event.get("frames", 0))  # missing from old journals
+        case "repaired":
+            _whole(event["frames"])
+            _whole(event["damaged"])
 
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":

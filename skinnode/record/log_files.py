@@ -7,7 +7,7 @@ from pathlib import Path
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
-from skinnode.record.journal import SUFFIX
+from skinnode.record.journal import new_journal_of
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import FrameLog, LoggedFrame, create
 
@@ -30,10 +30,10 @@ class LogFiles:
         self.path = path
         self._channels = channels(hand)
         self._log = FrameLog(path, tuple(self._channels.values()))
-        self._journal = None
+        self._journal, self._journal_path = None, new_journal_of(path)
         try:
             if journal:
-                self._journal = create(path.with_suffix(SUFFIX))
+                self._journal = create(self._journal_path)
         except ConfigError:
             self._log.close()
             path.unlink()
@@ -75,7 +75,7 @@ class LogFiles:
         """Delete the files."""
         self.path.unlink(missing_ok=True)
         if self._journal is not None:
-            self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
+            self._journal_path.unlink(missing_ok=True)
 
 
 def channels(hand: HandConfig) -> dict[str, str]:

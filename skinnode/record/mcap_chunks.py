@@ -29,6 +29,8 @@ _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # two times, size, checksum, lengt
 _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _MOST_CHUNK: Final = 1 << 26
 """Maximum uncompressed chunk size, bytes; the usual size is 1 MiB. A larger size indicates damage."""
+TRUNCATED: Final = "truncated"
+"""Description of a file that ends in the middle of a record."""
 _AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
 
 
@@ -129,7 +131,7 @@ class McapChunks:
                 continue
             following = _find_chunk(data, at + 1)
             if end is None or opcode != Opcode.CHUNK:  # otherwise the damage is already recorded
-                self.complain(at, "truncated" if following == size else "no record")
+                self.complain(at, TRUNCATED if following == size else "no record")
             at = following
 
     def _read(self, data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:

@@ -14,7 +14,7 @@ from skinnode.host.node_facts import NodeFacts
 from skinnode.model.forward import resistance_ohm
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
-from skinnode.record.journal import SUFFIX, Header, facts_table, parse_journal, read_journal
+from skinnode.record.journal import Header, facts_table, journal_of, parse_journal, read_journal
 from skinnode.record.log_files import channels
 from skinnode.record.mcap_file import MCAP
 from skinnode.record.mcap_reader import McapReader
@@ -107,7 +107,7 @@ def open_recording(path: Path) -> OpenRecording:
         frames: Frames = reader
         name, buses = f"{path.name} journal", {bus.name: bus.name for bus in header.hand.buses}
     else:
-        journal = path.with_suffix(SUFFIX)
+        journal = journal_of(path)
         header, events, complaints, raw = read_journal(journal)
         frames = FrameLogReader(path)
         name, buses = journal.name, _channels_in(path, header.hand)
@@ -178,7 +178,7 @@ def _require_no_journal(path: Path) -> None:
     if path.suffix == MCAP:
         found, where = any(McapReader(path).journal()), path.name
     else:
-        found, where = path.with_suffix(SUFFIX).exists(), path.with_suffix(SUFFIX).name
+        found, where = journal_of(path).exists(), journal_of(path).name
     if found:
         raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} has the hand")
 

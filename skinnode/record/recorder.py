@@ -147,6 +147,7 @@ class Recorder:
         self._bus_of = {patch.name: patch.bus for patch in hand.patches}
         self._solvers: dict[str, ScanSolver] = {}
         self._lost = self._lost_reported = self._fields_lost = 0
+        self._lost_before: list[Callable[[], int]] = []
         self._defects = Defects(str(path))
         self._flush_s = self._sync_s = clock.monotonic()
         self._ended = False
@@ -159,7 +160,8 @@ class Recorder:
     def stats(self) -> RecorderStats:
         """Return the number of frames recorded and lost so far."""
         fields = 0 if self._mcap is None else self._mcap.fields
-        return RecorderStats(self._file.frames, self._lost, self._failure, fields, self._fields_lost)
+        fields_lost = self._fields_lost + sum(lost() for lost in self._lost_before)
+        return RecorderStats(self._file.frames, self._lost, self._failure, fields, fields_lost)
 
     @property
     def records_fields(self) -> bool:
@@ -222,9 +224,9 @@ class Recorder:
             log_ns = clock.monotonic_ns() + self._offset_ns
             self._put(partial(self._mcap.write_event, event, self._offset_ns, log_ns), 0)
 
-    def lose_fields(self, fields: int) -> None:
-        """Count fields that were lost before they reached the recorder."""
-        self._fields_lost += fields
+    def count_lost_fields(self, lost: Callable[[], int]) -> None:
+        """Add a function that returns the number of fields lost before they reached the recorder."""
+        self._lost_before.append(lost)
 
     def close(self) -> None:
         """Write all queued entries, stop the thread and close the files; later entries are ignored."""

@@ -16,8 +16,7 @@ when journal events take effect and when incomplete scans time out.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -26,9 +25,11 @@ from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.health import PatchHealth, faults_of
+from skinnode.host.node_facts import NodeFacts
 from skinnode.host.patch_stream import StreamStats
 from skinnode.host.publish import Publisher
-from skinnode.model.frames import FieldFrame, ResistanceFrame
+from skinnode.host.scan_solver import ScanSolver
+from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
 from skinnode.record.open_recording import OpenRecording, open_log, open_recording
@@ -44,6 +45,15 @@ Longer pauses are shortened, because they may be due to damaged timestamps.
 
 _SLICE_S: Final = 0.1
 """Maximum delay before :meth:`Replay.stop` takes effect, s."""
+
+
+MakeSolver = Callable[[NodeFacts, HandConfig, Callable[[], int]], ScanSolver]
+"""Function that returns a patch's solver, given its facts, the hand and the clock (ns) for the stamps."""
+
+
+def live_solver(facts: NodeFacts, hand: HandConfig, now: Callable[[], int]) -> ScanSolver:
+    """Return the solver that a live host uses for a patch."""
+    return ScanSolver(facts, hand.solver, now, period_s=hand.sync.period_s)
 
 
 def _never() -> bool:
@@ -90,7 +100,8 @@ class Replay:
         recording: Open recording; the replay closes its file.
         speed: See :func:`replay`.
         cancelled: See :func:`replay`.
-        keep_resistances: Whether to keep the resistances of each solved scan in ``resistances``.
+        solver: Function that returns the solver of a patch; default: the solver of a live host.
+        buses: Names of the buses to replay; None for all. The buses do not affect each other.
     """
 
     def __init__(
@@ -99,7 +110,8 @@ class Replay:
         speed: float | None = None,
         cancelled: Callable[[], bool] = _never,
         *,
-        keep_resistances: bool = False,
+        solver: MakeSolver | None = None,
+        buses: Collection[str] | None = None,
     ) -> None:
         header, events, self.complaints = recording.header, recording.events, recording.complaints
         """One-line message for each unreadable part of the journal."""
@@ -107,15 +119,19 @@ class Replay:
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = recording.frames
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
-        ends = [event for event in events if event["event"] == "ended"]
+        repairs = [event for event in events if event["event"] == "repaired"]
+        ends = [event for event in events if event["event"] == "ended"] or repairs
         self.ended = bool(ends)
-        """Whether the recording was closed properly; False if its process was killed."""
+        """Whether the recording was closed properly or has been repaired; False if its process was killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
+        self._lacking = any(event["damaged"] for event in repairs)  # frames before the end
         self._read = 0
         self._first_ns: int | None = None
         self._journal = recording.journal
-        self.notes = recording.notes
-        """Assumptions that were made because the log has no journal."""
+        name = recording.frames.path.name
+        repaired = [f"{name} was repaired; it contains the readable part of a recording"] if repairs else []
+        self.notes = (*recording.notes, *repaired)
+        """Messages about a repair, and about assumptions that were made because the log has no journal."""
         self.incomplete: str | None = None
         """Description of the frames missing from the log; None if none are known to be missing."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
@@ -126,12 +142,12 @@ class Replay:
         self._buses = {
             bus.name: ReplayedBus(bus, self, [event for event in events if event["bus"] == bus.name])
             for bus in self.hand.buses
+            if buses is None or bus.name in buses
         }
         self._channels = recording.channels
         self.foreign = recording.foreign
-        self.resistances: deque[ResistanceFrame] | None = deque() if keep_resistances else None
-        """Resistances of the solved scans in order, NaN where they were not used; the caller removes them.
-        None unless requested."""
+        self._make_solver = live_solver if solver is None else solver
+        self._finished = 0  # number of buses whose last journal events have been applied
         self.strange = 0
         """Number of frames on channels that belong to no bus of the hand."""
 
@@ -142,11 +158,17 @@ class Replay:
             if name is None:
                 self.strange += 1
                 continue
-            self._buses[name].take(frame, sent=sent, whole=not (self.log.damaged or self.foreign))
+            if name not in self._buses:
+                continue
+            self._buses[name].take(
+                frame, sent=sent, whole=not (self.log.damaged or self.foreign or self._lacking)
+            )
             while (field := fields.get(0.0)) is not None:
                 yield field
-        for bus in self._buses.values():
-            bus.finish()
+        for number, bus in enumerate(self.hand.buses, 1):
+            self._finished = number
+            if bus.name in self._buses:
+                self._buses[bus.name].finish()
         while (field := fields.get(0.0)) is not None:
             yield field
 
@@ -219,7 +241,21 @@ class Replay:
 
     def patch_stats(self) -> dict[str, StreamStats]:
         """Return the counters of each patch."""
-        return {patch.name: self._stream_stats(patch.name) for patch in self.hand.patches}
+        patches = [patch for patch in self.hand.patches if patch.bus in self._buses]
+        return {patch.name: self._stream_stats(patch.name) for patch in patches}
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Current place in the recording, by which the fields are ordered.
+
+        The place consists of the number of frames read, and the number of buses whose last journal events
+        have been applied.
+        """
+        return self._read, self._finished
+
+    def solver_of(self, facts: NodeFacts) -> ScanSolver:
+        """Return a solver for the scans of a patch."""
+        return self._make_solver(facts, self.hand, self.clock)
 
     def _stream_stats(self, patch: str) -> StreamStats:
         return self._buses[self.hand.patch(patch).bus].patches[patch].stream.stats()

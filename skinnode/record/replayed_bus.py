@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtCommand, NmtState
-from skinnode.config import BusConfig, HandConfig
+from skinnode.config import BusConfig
 from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import BusStats, Dispatcher, PortCounters
-from skinnode.host.node_facts import NodeFacts
 from skinnode.host.patch_stream import StreamOutput
 from skinnode.host.reception import PatchReception, receive_bus, receive_patch
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline
-from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
-from skinnode.protocol.scan import Scan
 from skinnode.record.journal import facts_of
 
 if TYPE_CHECKING:
@@ -156,32 +153,7 @@ class ReplayedBus:
             self._solvers[name] = None
             try:
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
-                self._solvers[name] = self._solver_of(facts)
+                self._solvers[name] = replay.solver_of(facts)
             except (KeyError, TypeError, OverflowError, ValueError) as error:
                 replay.complain(event, f"unusable facts about {name} ({type(error).__name__}: {error})")
         return self._solvers.get(name)
-
-    def _solver_of(self, facts: NodeFacts) -> ScanSolver:
-        replay, hand = self._replay, self._replay.hand
-        if replay.resistances is None:
-            return ScanSolver(facts, hand.solver, replay.clock, period_s=hand.sync.period_s)
-        return _KeepingSolver(facts, hand, replay.clock, replay.resistances)
-
-
-class _KeepingSolver(ScanSolver):
-    """Solver that keeps the resistances of each scan."""
-
-    def __init__(
-        self,
-        facts: NodeFacts,
-        hand: HandConfig,
-        now: Callable[[], int],
-        kept: deque[ResistanceFrame],
-    ) -> None:
-        super().__init__(facts, hand.solver, now, period_s=hand.sync.period_s)
-        self._kept = kept
-
-    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        solved = super().solve(scan, stamp)
-        self._kept.append(self.decode(scan, stamp))
-        return solved

@@ -4,7 +4,7 @@ Data flows in one direction::
 
     source (skinnode.monitor) -> bounded queue of fields -> drawing_thread -> tick
         -> drawing_process (child process) -> drawing -> stream of the SDK -> window, browser or file
-    recording -> conversion -> tick -> drawing -> stream -> file
+    recording -> conversion -> tick -> drawing -> stream -> file (file_conversion)
 
 ``picture`` computes a field's picture, using shapes from ``geometry`` and colours from ``colours``;
 ``placement`` positions the patches. ``texts`` writes Markdown tables. ``drawing`` writes both to a recording

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from skinnode.config import HandConfig
 from skinnode.host.events import Events
 from skinnode.host.health_watch import HealthWatch
 from skinnode.model.frames import FieldFrame
@@ -34,14 +35,21 @@ class Conversion:
     Args:
         path: Log file of the recording.
         cancelled: Function called before each frame; the conversion ends when it returns True.
+        hand: Hand for a log without a journal.
 
     Raises:
         ConfigError: The recording cannot be read.
     """
 
-    def __init__(self, path: Path, cancelled: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        cancelled: Callable[[], bool] = lambda: False,
+        *,
+        hand: HandConfig | None = None,
+    ) -> None:
         self._cancelled = cancelled
-        self.replay: Replay = replay(path, cancelled=self._before_frame)
+        self.replay: Replay = replay(path, cancelled=self._before_frame, hand=hand)
         """The replay; its ``hand`` is the recorded hand."""
         self.faults = FaultBook(live=False)
         self._history = History(self.replay.hand, live=False)

@@ -127,6 +127,8 @@ OPTIONS: dict[str, Callable[[str], list[str]]] = {
     "replay --hand": lambda file: ["replay", "x.log", "--hand", file],
     "convert": lambda file: ["convert", file, "y.npz"],
     "convert --hand": lambda file: ["convert", "x.log", "y.npz", "--hand", file],
+    "resolve": lambda file: ["resolve", file, "-o", "solved"],
+    "resolve --hand": lambda file: ["resolve", "x.log", "-o", "solved", "--hand", file],
     "monitor --replay": lambda file: ["monitor", "--json", "--replay", file],
     "view --replay": lambda file: ["view", "--web", "--replay", file],
     "info --eds": lambda file: ["info", "5", *BUS, "--eds", file],

@@ -160,6 +160,10 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
         [place.hand(), "-o", place.missing],
     ],
     "replay": lambda place: [[place.missing], [place.file("evil.log", f"(1.0) {EVIL} 123#00\n")]],
+    "resolve": lambda place: [
+        [place.missing, "-o", str(place.folder / "solved")],
+        [place.file("evil.log", f"(1.0) {EVIL} 123#00\n"), "-o", place.missing, "--set", WORSE],
+    ],
     "convert": lambda place: [
         [place.missing, WORSE],
         [

@@ -12,6 +12,7 @@ import pytest
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
+from skinnode.host.code_watch import Verdict
 from skinnode.host.containment import Defects
 from skinnode.host.node_facts import NodeFacts
 from skinnode.host.patch_stream import PatchStream, StreamOptions, StreamOutput, StreamStats
@@ -49,7 +50,7 @@ class Stub:
         self.error: Exception | None = None
         self.facts = SimpleNamespace(checked=False)
 
-    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+    def solve(self, scan: Scan, stamp: ScanStamp, verdict: Verdict) -> tuple[FieldFrame, int]:
         self.entered.set()
         self.go.wait(10)
         if self.error is not None:
@@ -284,11 +285,11 @@ def test_a_worker_that_finds_no_successor_leaves_the_lane_open(publisher: Publis
     workers, defects = Full(), Defects("thumb")
 
     class Slow(Stub):
-        def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+        def solve(self, scan: Scan, stamp: ScanStamp, verdict: Verdict) -> tuple[FieldFrame, int]:
             if stamp.counter == 1:
                 feed(stream, 2, MS)
                 workers.full = True
-            return super().solve(scan, stamp)
+            return super().solve(scan, stamp, verdict)
 
     slow = Slow()
     slow.go.set()

@@ -33,7 +33,8 @@ from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.messages.definitions import DEFINITIONS, JOURNAL_LINE
 from skinnode.model.frames import FieldFrame
-from skinnode.record import Recorder, followed, replay
+from skinnode.record import Recorder, Replay, followed, replay
+from skinnode.record.convert import convert
 from skinnode.record.mcap_reader import McapReader
 from skinnode.transport.frame import Frame
 from vcan_sim.fleet import Fleet
@@ -64,7 +65,17 @@ def run(
     stats = recorder.stats()
     assert (stats.failure, stats.dropped, stats.fields_dropped) == (None, 0, 0)
     assert stats.fields >= len(live) > 60
+    assert stats.fields == len(list(replay(path)))  # with the scans that ended while the host closed
     return path, hand, live
+
+
+def chunks_in(data: bytes) -> list[int]:
+    """Offsets of the chunks of a file."""
+    return [at for at in range(len(data)) if data[at] == 0x06 and data[at + 41 : at + 45] == b"zstd"]
+
+
+def bits(run: Replay) -> list[tuple[str, int, bytes]]:
+    return [(*key(field), field.displacement_m.tobytes()) for field in run]
 
 
 def test_rosbags_reads_the_fields_that_the_host_gave(run: Any) -> None:
@@ -433,7 +444,7 @@ def test_killed_twenty_times_it_reads_up_to_the_last_second(tmp_path: Path) -> N
         done = CliRunner().invoke(app, ["convert", str(path), str(repaired)])
         assert done.exit_code == int(damaged > 0), done.output
         with AnyReader([repaired]) as bag:
-            assert bag.message_count == theirs
+            assert bag.message_count == theirs + 1  # and the journal line that tells of the repair
 
 
 def test_readers_that_need_the_index_refuse_a_killed_file_and_take_the_repaired_one(tmp_path: Path) -> None:
@@ -446,9 +457,45 @@ def test_readers_that_need_the_index_refuse_a_killed_file_and_take_the_repaired_
     done = CliRunner().invoke(app, ["convert", str(path), str(repaired)])
     assert done.exit_code == 0, done.output
     with repaired.open("rb") as file:
-        assert len(list(make_reader(file).iter_messages())) == len(numbers_in(path)[0]) + 1
+        assert len(list(make_reader(file).iter_messages())) == len(numbers_in(path)[0]) + 2
     with AnyReader([repaired]) as bag:
-        assert bag.message_count == len(numbers_in(path)[0]) + 1
+        assert bag.message_count == len(numbers_in(path)[0]) + 2
+
+
+def test_a_repaired_recording_is_whole_and_says_that_it_was_repaired(tmp_path: Path, run: Any) -> None:
+    """Its replay has no fault, and the fields of the readable part of the original."""
+    whole, cut, good, again = (tmp_path / f"{name}.mcap" for name in ("whole", "cut", "good", "again"))
+    whole.write_bytes(run[0].read_bytes())
+    convert(whole, tmp_path / "copy.mcap")
+    assert replay(tmp_path / "copy.mcap").notes == ()
+    data = whole.read_bytes()
+    chunks = chunks_in(data)
+    cut.write_bytes(data[: chunks[len(chunks) // 2]])
+    killed = replay(cut)
+    wanted = bits(killed)
+    assert any("not ended properly" in flaw for flaw in killed.flaws)
+    for source, target in ((cut, good), (good, again)):
+        convert(source, target)
+        played = replay(target)
+        assert bits(played) == wanted
+        assert (played.flaws, len(wanted) > 20) == ([], True)
+        assert [note for note in played.notes if "was repaired" in note]
+
+
+def test_a_repaired_recording_knows_that_a_part_is_missing_inside(tmp_path: Path, run: Any) -> None:
+    """The numbers of frames in its journal no longer hold, so its events take effect by their times."""
+    bad, good = tmp_path / "bad.mcap", tmp_path / "good.mcap"
+    data = bytearray(run[0].read_bytes())
+    chunks = chunks_in(data)
+    data[chunks[len(chunks) // 2] + 200] ^= 0xFF
+    bad.write_bytes(data)
+    done = convert(bad, good)
+    assert any("cannot be read" in fault for fault in done.faults)
+    damaged, repaired = replay(bad), replay(good)
+    before, after = bits(damaged), bits(repaired)
+    assert damaged.log.damaged == 1
+    assert after[-10:] == before[-10:]
+    assert [flaw for flaw in repaired.flaws if "frames, but" in flaw]
 
 
 HOST = """

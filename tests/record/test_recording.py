@@ -5,20 +5,23 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
-from skinnode.config import BusConfig, HandConfig, parse_hand
+from skinnode.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.errors import BusError, ConfigError
 from skinnode.host import Host
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, replay
 from skinnode.transport import CanPort
@@ -277,3 +280,47 @@ def test_what_has_no_name_is_no_recording(name: str) -> None:
         ConfigError, match=r"^recording: got '[./]', allowed: a file ending in .log, .blf, .asc or .mcap$"
     ):
         replay(name)
+
+
+def test_two_logs_of_one_name_in_a_folder_have_a_journal_each(tmp_path: Path) -> None:
+    hand = hand_on(BusConfig(interface="virtual", channel="two-logs"))
+    live: dict[str, set[tuple[str, int]]] = {}
+    for suffix in (".log", ".blf"):
+        with (
+            Fleet(hand),
+            Recorder(hand, tmp_path / f"run{suffix}") as recorder,
+            Host.from_config(hand, tap=recorder) as host,
+        ):
+            fields = host.fields(capacity=1000)
+            time.sleep(0.4 if suffix == ".log" else 0.8)
+        live[suffix] = set()
+        while (field := fields.get(0.0)) is not None:
+            live[suffix].add(key(field))
+    for suffix, wanted in live.items():
+        run = replay(tmp_path / f"run{suffix}")
+        assert {key(field) for field in run} >= wanted > set()
+        assert run.flaws == []  # such as a journal of another number of frames
+
+
+def test_scans_that_were_skipped_are_noted_as_a_replay_counts_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand, path = tmp_path / "hand.toml", tmp_path / "run.log"
+    hand.write_text(HAND.replace("period_ms = 100", "period_ms = 25"))
+    solve = ScanSolver.solve
+
+    def slowly(self: ScanSolver, *arguments: Any) -> Any:
+        time.sleep(0.1)
+        return solve(self, *arguments)
+
+    with Fleet(load_hand(hand)), monkeypatch.context() as patched:
+        patched.setattr(ScanSolver, "solve", slowly)
+        done = CliRunner().invoke(app, ["record", str(hand), "-o", str(path), "--seconds", "2"])
+    run = replay(path)
+    solved = len(list(run))
+    skipped = run.patch_stats()["thumb"].skipped
+    assert skipped > solved
+    (note,) = [line for line in done.stdout.splitlines() if "skipped for newer" in line]
+    found = re.fullmatch(r"note: thumb: (\d+) scans skipped for newer ones; their frames were recorded", note)
+    assert found is not None
+    assert abs(int(found[1]) - skipped) <= 1  # a scan may be skipped while the host closes

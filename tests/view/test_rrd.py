@@ -203,6 +203,23 @@ def test_the_command_converts_a_recording(recording: Path, tmp_path: Path, sdk: 
     assert len(Rows(path).of) == len(rows.of)  # and is as it was
 
 
+def test_convert_draws_as_view_does_unless_told_otherwise(recording: Path, tmp_path: Path, sdk: None) -> None:
+    drawn, converted = tmp_path / "drawn.rrd", tmp_path / "converted.rrd"
+    view("--replay", str(recording), "--save", str(drawn))
+    code = "from skinnode.cli.main import main; main()"
+    arguments = [sys.executable, "-W", "error", "-c", code, "convert", str(recording), str(converted)]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60.0, check=True)
+    fields = len(list(replay(recording)))
+    assert done.stdout.splitlines()[0] == f"{converted}: {fields} fields"
+    wanted, found = Rows(drawn), Rows(converted)
+    assert sorted(found.of) == sorted(wanted.of)
+    for patch in ("p0", "p1"):
+        path = f"/skin/hand/{patch}/surface"
+        assert found.scans(path) == wanted.scans(path) != {}
+    again = subprocess.run(arguments, capture_output=True, text=True, timeout=60.0, check=False)
+    assert (again.returncode, "allowed: a new file; this one exists" in again.stderr) == (2, True)
+
+
 def test_a_damaged_recording_is_converted_as_far_as_it_goes(
     recording: Path, tmp_path: Path, sdk: None
 ) -> None:

@@ -1,0 +1,157 @@
+"""Parses ``--set`` options, and applies them to the hand of a recording."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from skinnode.config import HandConfig, PatchConfig, SolverConfig, parse_hand
+from skinnode.errors import ConfigError
+
+_PATCH_KEYS: Final = ("relative_noise", "calibration", "tolerances", "layout")
+"""Keys of a patch that describe its skin, not its identity on the bus."""
+_EVERY_PATCH: Final = "*"
+_ALLOWED: Final = (
+    "solver.KEY, or patches.NAME.KEY, where NAME is a patch or * for all, "
+    f"and KEY is {', '.join(_PATCH_KEYS[:-1])} or {_PATCH_KEYS[-1]}, or a key of one of these tables"
+)
+_WITHOUT_LIMIT: Final = "no time limit, because the results would depend on the speed of the computer"
+_LIVE: Final = {"deadline_us": _WITHOUT_LIMIT, "workers": "--processes instead"}
+"""Keys of the solver that only a live host uses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Key and value of an option."""
+
+    key: str
+    value: Any
+    text: str
+    """Value as the user wrote it."""
+
+
+Variant = tuple[Setting, ...]
+"""Settings of one combination of a sweep."""
+
+
+def variants(options: Sequence[str]) -> list[Variant]:
+    """Return all combinations of the values of options.
+
+    Args:
+        options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. A value is a TOML value; a value that is not
+            TOML is a string.
+
+    Raises:
+        ConfigError: An option has no key or value, a key that cannot be set, or occurs twice.
+    """
+    found: dict[str, list[Setting]] = {}
+    for option in options:
+        key, equals, text = option.partition("=")
+        key = key.strip()
+        if not equals or not key or not text.strip():
+            raise ConfigError("--set", option, "KEY=VALUE, or KEY=VALUE,VALUE,… for a sweep")
+        _check(key)
+        if key in found:
+            raise ConfigError("--set", option, f"{key} only once; separate several values by commas")
+        found[key] = [Setting(key, _value(part), part) for part in _split(text)]
+    return list(itertools.product(*found.values()))
+
+
+def apply(hand: HandConfig, variant: Variant) -> HandConfig:
+    """Return a copy of the hand with the settings of a variant, and without a time limit for solving.
+
+    Raises:
+        ConfigError: A patch or a key does not exist, or a value is not allowed.
+    """
+    table = hand.model_dump(exclude_defaults=True)
+    for setting in variant:
+        for path in _paths(hand, setting):
+            _set(table, path, setting)
+    solver = table.get("solver", {})
+    for key in _LIVE:
+        solver.pop(key, None)
+    return parse_hand(table, where="--set")
+
+
+def name_of(variant: Variant) -> str:
+    """Return a short text of a variant, such as ``method=exact drift=none``."""
+    return " ".join(f"{setting.key.rpartition('.')[2]}={setting.text}" for setting in variant)
+
+
+def _check(key: str) -> None:
+    parts = key.split(".")
+    if parts[0] == "solver" and len(parts) == 2:
+        if parts[1] in _LIVE:
+            raise ConfigError("--set", key, _LIVE[parts[1]])
+        return
+    if parts[0] == "patches" and len(parts) >= 3:
+        _, wanted = _patch_and_key(key)
+        if wanted[0] in _PATCH_KEYS:
+            return
+    raise ConfigError("--set", key, _ALLOWED)
+
+
+def _patch_and_key(key: str) -> tuple[str, list[str]]:
+    """Split ``patches.NAME.KEY``; the name may contain dots, because no key of the skin is a usual name."""
+    parts = key.split(".")[1:]
+    for at in range(1, len(parts)):
+        if parts[at] in PatchConfig.model_fields:
+            return ".".join(parts[:at]), parts[at:]
+    return parts[0], parts[1:]
+
+
+def _paths(hand: HandConfig, setting: Setting) -> list[list[str | int]]:
+    """Return the paths in the table of a hand that a setting changes."""
+    if setting.key.startswith("solver."):
+        return [list(setting.key.split("."))]
+    name, keys = _patch_and_key(setting.key)
+    names = [patch.name for patch in hand.patches]
+    if name != _EVERY_PATCH and name not in names:
+        raise ConfigError("--set", setting.key, f"a patch of the recording: {', '.join(names)}; or * for all")
+    return [["patches", i, *keys] for i, each in enumerate(names) if name in (_EVERY_PATCH, each)]
+
+
+def _set(table: Any, path: list[str | int], setting: Setting) -> None:
+    for part in path[:-1]:
+        if isinstance(part, int):
+            table = table[part]
+            continue
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict | list | tuple):
+            raise ConfigError("--set", setting.key, f"{part} itself, which is no table here")
+    table[path[-1]] = setting.value
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _split(text: str) -> list[str]:
+    """Split a text at the commas outside brackets and quotes."""
+    parts, depth, quote = [""], 0, ""
+    for character in text:
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "\"'":
+            quote = character
+        elif character == "," and not depth:
+            parts.append("")
+            continue
+        else:
+            depth += (character in "[{") - (character in "]}")
+        parts[-1] += character
+    return [part.strip() for part in parts]
+
+
+def capture_hand(hand: HandConfig) -> HandConfig:
+    """Return the hand without the settings of the solver; variants with the same result share the scans."""
+    plain = PatchConfig(name="any", node_id=1)
+    same = {"calibration": plain.calibration, "tolerances": plain.tolerances}
+    patches = tuple(patch.model_copy(update=same) for patch in hand.patches)
+    return hand.model_copy(update={"patches": patches, "solver": SolverConfig()})

@@ -1,0 +1,33 @@
+"""Interface of the workers that run units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from skinnode.resolve.units import Unit
+
+
+class Workers(Protocol):
+    """Workers that run units in any order."""
+
+    @property
+    def count(self) -> int:
+        """Number of units that can run at the same time."""
+
+    def submit(self, unit: Unit) -> None:
+        """Run a unit as soon as a worker is free."""
+
+    def finished(self, timeout_s: float) -> Sequence[str]:
+        """Wait for finished units, for at most ``timeout_s`` seconds, and return their keys.
+
+        Raises:
+            SkinError: A unit or all workers failed.
+        """
+
+    def close(self) -> None:
+        """End the running units and the workers."""
+
+
+MOST_DEATHS = 3
+"""Number of workers that may end while running the same unit."""

@@ -1,0 +1,309 @@
+"""Recordings solved again: the bytes of the serial road, whoever solves and whoever dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rosbags.highlevel import AnyReader
+from typer.testing import CliRunner
+
+from skinnode.cli.main import app
+from skinnode.config import HandConfig
+from skinnode.errors import SkinError
+from skinnode.record import replay
+from skinnode.record.convert import convert
+from skinnode.record.sources import open_recording
+from skinnode.resolve import processes
+from skinnode.resolve.part_files import PartFiles
+from skinnode.resolve.plan import make_plan
+from skinnode.resolve.recording import recording_at
+from skinnode.resolve.run import WORK_FOLDER, run, work_folder
+
+
+def resolve(*arguments: object, status: int = 0) -> Any:
+    done = CliRunner().invoke(app, ["resolve", *map(str, arguments), "--json"])
+    assert done.exit_code == status, (done.output, done.exception)
+    return json.loads(done.stdout)["results"]
+
+
+def refusal(*arguments: object) -> str:
+    """The line of a command that is refused, which leaves nothing behind."""
+    done = CliRunner().invoke(app, ["resolve", *map(str, arguments)])
+    assert isinstance(done.exception, SkinError), done.output
+    assert "\n" not in str(done.exception)
+    return str(done.exception)
+
+
+def messages_in(path: Path | str) -> list[tuple[object, ...]]:
+    """Messages of an MCAP file in file order, as rosbags reads them, without the CPU times of the fields."""
+    found: list[tuple[object, ...]] = []
+    with AnyReader([Path(path)]) as bag:
+        for connection, t_ns, raw in bag.messages():
+            content: object = bytes(raw)
+            if connection.topic.endswith("/field_info"):
+                message: Any = bag.deserialize(raw, connection.msgtype)
+                content = repr(
+                    {name: value for name, value in vars(message).items() if name != "solve_time_s"}
+                )
+            found.append((connection.topic, t_ns, content))
+    return found
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("kind", ["parquet", "mcap"])
+def test_the_file_is_the_one_that_convert_writes(
+    recording: Path, tmp_path: Path, kind: str, count: int
+) -> None:
+    wanted = tmp_path / f"wanted.{kind}"
+    convert(recording, wanted)
+    (result,) = resolve(recording, "-o", tmp_path / "out", "--format", kind, "--processes", count)
+    if kind == "mcap":  # contains the time that each solve took
+        assert messages_in(result["file"]) == messages_in(wanted)
+    else:
+        assert Path(result["file"]).read_bytes() == wanted.read_bytes()
+    assert os.listdir(tmp_path / "out") == [f"run.{kind}"]
+    assert result["fields"] == len(list(replay(recording))) > 250
+    assert result["faults"] == result["notes"] == []
+
+
+def solved_live(recording: Path, **solver: object) -> dict[tuple[str, int], bytes]:
+    """Replay with other options in the journal, as a host with these options would have solved the scans."""
+    copy = recording.with_name("changed.log")
+    first, *rest = recording.with_suffix(".jsonl").read_text().splitlines(keepends=True)
+    header = json.loads(first)
+    header["hand"]["solver"] = solver
+    copy.write_bytes(recording.read_bytes())
+    copy.with_suffix(".jsonl").write_text(json.dumps(header) + "\n" + "".join(rest))
+    fields = {}
+    for field in replay(copy):
+        assert field.stamp is not None
+        fields[field.stamp.patch, field.stamp.scan] = field.displacement_m.tobytes()
+    return fields
+
+
+def test_a_sweep_has_a_file_and_a_line_for_each_value(recording: Path, tmp_path: Path) -> None:
+    results = resolve(recording, "-o", tmp_path, "--set", "solver.method=exact,posterior", "--processes", 1)
+    assert [each["settings"] for each in results] == [{"solver.method": m} for m in ("exact", "posterior")]
+    for result in results:
+        method = result["settings"]["solver.method"]
+        assert Path(result["file"]).name == f"run-method={method}.parquet"
+        table = pq.read_table(result["file"]).to_pylist()
+        wanted = solved_live(recording, method=method)
+        found = {(row["patch"], row["scan"]): np.array(row["displacement_m"]).tobytes() for row in table}
+        assert found == wanted
+        assert result["touched"] == sum(row["touched"] == 1 for row in table) > 20
+        assert result["untrusted"] == sum(not row["trusted"] for row in table)
+        assert result["contacts"] == sum(len(row["contacts"]) for row in table)
+        assert {row["method"] for row in table if not all(row["held"])} <= {method}
+
+
+def test_a_calibration_of_one_patch_changes_its_forces_only(recording: Path, tmp_path: Path) -> None:
+    key = "patches.p1.calibration.young_pa"
+    results = resolve(recording, "-o", tmp_path, "--set", f"{key}=1e6,2e6", "--processes", 1)
+    soft, hard = (pq.read_table(each["file"]).to_pylist() for each in results)
+    forces = 0
+    for row, other in zip(soft, hard, strict=True):
+        assert row["displacement_m"] == other["displacement_m"]
+        for contact, twin in zip(row["contacts"], other["contacts"], strict=True):
+            ratio = twin["normal_force_n"] / contact["normal_force_n"]
+            assert ratio == pytest.approx(2.0 if row["patch"] == "p1" else 1.0, rel=1e-9)
+            forces += row["patch"] == "p1"
+    assert forces > 10
+
+
+def test_a_replay_of_a_result_gives_its_fields(recording: Path, tmp_path: Path) -> None:
+    """The journal of the MCAP file contains the options with which it was solved."""
+    setting = "solver.method=posterior"
+    (result,) = resolve(recording, "-o", tmp_path, "--format", "mcap", "--set", setting, "--processes", 1)
+    wanted = solved_live(recording, method="posterior")
+    found = {}
+    for field in replay(result["file"]):
+        assert field.stamp is not None
+        found[field.stamp.patch, field.stamp.scan] = field.displacement_m.tobytes()
+    assert found == wanted
+
+
+def job_of(recording: Path, folder: Path, count: int = 2) -> Any:
+    (job,) = make_plan([recording_at(recording, None)], [()], folder, ".parquet", count)
+    return job
+
+
+def test_processes_that_are_killed_change_nothing(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One or two of them, while they work."""
+    wanted = tmp_path / "wanted.parquet"
+    convert(recording, wanted)
+    started: list[processes.SpawnProcess] = []
+    start = processes.Processes._start
+
+    def watched(self: processes.Processes) -> Any:
+        child = start(self)
+        started.append(child.process)
+        return child
+
+    monkeypatch.setattr(processes.Processes, "_start", watched)
+    killed = 0
+    with work_folder(tmp_path) as folder, processes.Processes(2, folder) as workers:
+
+        def kill(done: int, total: int, newest: str) -> None:
+            nonlocal killed
+            busy = [child for child in workers._children if child.unit is not None]
+            if busy and killed < 2:
+                busy[0].process.kill()
+                killed += 1
+
+        (summary,) = run([job_of(recording, tmp_path)], workers, PartFiles(folder), kill)
+    assert killed > 0
+    assert len(started) > 2  # others have taken their place
+    assert (tmp_path / "run.parquet").read_bytes() == wanted.read_bytes()
+    assert summary.sums.fields == len(list(replay(recording)))
+
+
+def test_a_unit_that_kills_every_process_is_named(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = processes.Processes._start
+
+    def killed(self: processes.Processes) -> Any:
+        child = start(self)
+        child.process.kill()
+        return child
+
+    monkeypatch.setattr(processes.Processes, "_start", killed)
+    named = pytest.raises(SkinError, match=r"run\.log: its process ended 3 times \(.*-9\); .*--processes")
+    with work_folder(tmp_path) as folder, processes.Processes(1, folder) as workers, named:
+        run([job_of(recording, tmp_path, 1)], workers, PartFiles(folder), lambda *_: None)
+
+
+COMMAND = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "resolve"]
+
+
+def test_a_killed_command_continues_where_it_was(recording: Path, tmp_path: Path) -> None:
+    wanted = tmp_path / "wanted.parquet"
+    convert(recording, wanted)
+    out = tmp_path / "out"
+    arguments = [str(recording), "-o", str(out), "--processes", "1"]
+    with subprocess.Popen([*COMMAND, *arguments]) as child:
+        end_s = time.monotonic() + 60.0
+        while not (parts := sorted(out.glob(f"{WORK_FOLDER}/*.part"))) or len(parts) < 5:  # a patch is solved
+            assert time.monotonic() < end_s
+            assert child.poll() is None
+            time.sleep(0.01)
+        child.send_signal(signal.SIGKILL)
+    before = {part: part.stat().st_mtime_ns for part in parts}
+    assert not (out / "run.parquet").exists()
+    job, files = job_of(recording, out, 1), PartFiles(out / WORK_FOLDER)
+    assert len(job.units(files)) < len([*job.captures, *job.solves, job.write])
+    assert {part: part.stat().st_mtime_ns for part in parts} == before
+    (result,) = resolve(*arguments)
+    assert (out / "run.parquet").read_bytes() == wanted.read_bytes()
+    assert os.listdir(out) == ["run.parquet"]
+    assert result["fields"] == len(list(replay(recording)))
+
+
+def test_two_commands_do_not_share_a_folder(recording: Path, tmp_path: Path) -> None:
+    with work_folder(tmp_path):
+        said = refusal(recording, "-o", tmp_path)
+    assert "allowed: a folder that no other skinnode resolve is using" in said
+
+
+def test_a_damaged_recording_is_solved_and_named(recording: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.log"
+    data = recording.read_bytes()
+    cut.write_bytes(data[: len(data) // 2])
+    journal = recording.with_suffix(".jsonl").read_text().splitlines(keepends=True)
+    cut.with_suffix(".jsonl").write_text("".join(journal[:-1]))
+    (result,) = resolve(cut, "-o", tmp_path / "out", "--processes", 2, status=1)
+    played = replay(cut)
+    assert result["fields"] == len(list(played)) > 50
+    assert result["faults"][:2] == played.flaws[:2]
+    assert any("not ended properly" in fault for fault in result["faults"])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            ["--set", "solver.metod=exact"],
+            "solver.metod: got an unknown key, allowed: a key of this table (did",
+        ),
+        (["--set", "solver.method=fast"], "solver.method: got 'fast', allowed: auto or exact or posterior"),
+        (["--set", "method=exact"], "--set: got 'method', allowed: solver.KEY, or patches.NAME.KEY"),
+        (["--set", "solver.method"], "--set: got 'solver.method', allowed: KEY=VALUE"),
+        (["--set", "solver.deadline_us=100"], "allowed: no time limit"),
+        (["--set", "patches.p9.relative_noise=1e-5"], "allowed: a patch of the recording: p0, p1, p2; or *"),
+        (["--set", "patches.p0.node_id=9"], "--set: got 'patches.p0.node_id', allowed: solver.KEY"),
+        (["--set", "solver.drift=wire", "--set", "solver.drift=none"], "solver.drift only once"),
+        (
+            ["--set", "solver.method=exact", "--set", "solver.drift=wire"],
+            "cannot be solved with these settings",
+        ),
+        (["--processes", "1", "--scheduler", "tcp://127.0.0.1:1"], "allowed: only without --scheduler"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_one_line(
+    recording: Path, tmp_path: Path, options: list[str], said: str
+) -> None:
+    assert said in refusal(recording, "-o", tmp_path / "out", *options)
+    if "cannot be solved" not in said:
+        assert not (tmp_path / "out").exists()
+
+
+def test_files_that_cannot_be_used_are_one_line(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.log").write_text("(1.000000) can0 185#00 R\n")
+    (tmp_path / "x.txt").write_text("no recording")
+    out = tmp_path / "out"
+    assert "allowed: a journal next to the log" in refusal(tmp_path / "other.log", "-o", out)
+    assert "allowed: a file ending in" in refusal(tmp_path / "x.txt", "-o", out)
+    twin = tmp_path / "run.log"
+    for suffix in (".log", ".jsonl"):
+        twin.with_suffix(suffix).write_bytes(recording.with_suffix(suffix).read_bytes())
+    assert "allowed: recordings whose names differ" in refusal(recording, twin, "-o", out)
+    assert not out.exists()
+    out.mkdir()
+    (out / "run.parquet").write_text("mine")
+    assert "allowed: a new file; this one exists" in refusal(recording, "-o", out)
+    assert (out / "run.parquet").read_text() == "mine"
+
+
+def test_a_recording_that_changes_meanwhile_is_refused(recording: Path, tmp_path: Path) -> None:
+    twin = tmp_path / "twin.log"
+    for suffix in (".log", ".jsonl"):
+        twin.with_suffix(suffix).write_bytes(recording.with_suffix(suffix).read_bytes())
+    known, hand = recording_at(twin, None)
+    twin.write_bytes(recording.read_bytes() + b"\n")
+    with pytest.raises(SkinError, match="is not the file that the command started with"):
+        known.opened(hand)
+
+
+def test_a_log_of_another_master_is_solved_with_the_hand_file(recording: Path, tmp_path: Path) -> None:
+    opened = open_recording(recording)
+    opened.frames.close()
+    hand: HandConfig = opened.header.hand
+    (tmp_path / "other.log").write_bytes(recording.read_bytes())
+    sizes = ", ".join(f"{key} = {value}" for key, value in {"upper_wires": 4, "upper_electrodes": 4}.items())
+    text = "".join(f'[[buses]]\nname = "{bus.name}"\nchannel = "{bus.name}"\n' for bus in hand.buses)
+    for patch in hand.patches:
+        text += f'[[patches]]\nname = "{patch.name}"\nnode_id = {patch.node_id}\nbus = "{patch.bus}"\n'
+        text += f'tolerances = "exact"\nlayout = {{ {sizes}, lower_wires = 12, lower_electrodes = 4 }}\n'
+    plan = tmp_path / "hand.toml"
+    plan.write_text(text + "[sync]\nperiod_ms = 25\n")
+    arguments = ["--hand", plan, "--processes", 2, "-o", tmp_path / "out"]
+    (result,) = resolve(tmp_path / "other.log", *arguments, status=0)
+    from skinnode.config import load_hand
+
+    wanted = tmp_path / "wanted.parquet"
+    convert(tmp_path / "other.log", wanted, hand=load_hand(plan))
+    assert Path(result["file"]).read_bytes() == wanted.read_bytes()
+    assert len(result["notes"]) == 3

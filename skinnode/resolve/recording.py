@@ -9,7 +9,7 @@ from skinnode.config import HandConfig
 from skinnode.errors import ConfigError, SkinError
 from skinnode.record.journal import Header, journal_of
 from skinnode.record.mcap_file import MCAP
-from skinnode.record.sources import OpenRecording, open_log, open_recording
+from skinnode.record.open_recording import OpenRecording, open_log, open_recording
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.record import replay
 from skinnode.record.convert import convert
-from skinnode.record.sources import open_recording
+from skinnode.record.open_recording import open_recording
 from skinnode.resolve import processes
 from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.plan import make_plan

@@ -37,7 +37,7 @@ for seed in sys.argv[1:]:
                 fields.update(repr((field.stamp, field.status)).encode() + field.displacement_m.tobytes())
                 seen += 1
         print(len(trace), hashlib.sha256(trace.text().encode()).hexdigest(), seen, fields.hexdigest())
-        print(trace.text()[:60])
+        print(trace.text().splitlines()[0])
 """
 
 

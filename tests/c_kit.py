@@ -28,7 +28,9 @@ REQUIRE_COMPILERS: Final = "SKINNODE_REQUIRE_COMPILERS"
 COMPILERS: Final = ("gcc", "clang")
 DRIVER: Final = Path(__file__).with_name("c_driver.c")
 STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
-SANITIZED: Final = (*STRICT, "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZED: Final = (*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+LEVELS: Final = {"gcc": "-O1", "clang": "-O0"}
+"""One program is optimised, and the other is as written; clang needs three times as long for -O1."""
 
 NO_SCAN, COMPLETE, TORN, UNCHECKED, MIXED, CORRUPT, JOINED = range(7)
 PUBLISHED: Final = (COMPLETE, TORN, UNCHECKED)
@@ -43,6 +45,14 @@ def require(compiler: str) -> str:
             pytest.fail(f"{REQUIRE_COMPILERS} is set, but there is no {compiler}")
         pytest.skip(f"no {compiler} on this machine")
     return path
+
+
+def available() -> list[str]:
+    """Return the compilers of this machine. Skips where there is none."""
+    found = [compiler for compiler in COMPILERS if shutil.which(compiler)]
+    if os.environ.get(REQUIRE_COMPILERS) or not found:
+        return [require(compiler) and compiler for compiler in COMPILERS]
+    return found
 
 
 @functools.cache
@@ -68,7 +78,7 @@ def compile_c(arguments: Sequence[str | Path]) -> None:
 def _program(profile: PatchProfile, compiler: str) -> Path:
     folder = Path(_scratch().name) / f"{compiler}-{abs(hash(profile))}"
     source, program = write_kit(profile, folder), folder / "driver"
-    compile_c([require(compiler), *SANITIZED, "-I", folder, source, DRIVER, "-o", program])
+    compile_c([require(compiler), *SANITIZED, LEVELS[compiler], "-I", folder, source, DRIVER, "-o", program])
     return program
 
 
@@ -84,29 +94,34 @@ class CScan:
 
 
 class Kit:
-    """A process that runs the kit for one patch.
+    """Processes that run the kit for one patch, one for each compiler.
 
-    Commands are collected, and sent by :meth:`ask`, which returns the reply to all of them.
+    Commands are collected, and sent by :meth:`ask`, which returns the reply to all of them. All programs must
+    reply the same.
     """
 
-    def __init__(self, profile: PatchProfile, compiler: str = "gcc") -> None:
-        require(compiler)
+    def __init__(self, profile: PatchProfile, *compilers: str) -> None:
         self.profile = profile
         self._commands = bytearray()
-        self._process = subprocess.Popen(
-            [_program(profile, compiler)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, "ASAN_OPTIONS": "detect_leaks=0"},
-        )
+        programs = {compiler: _program(profile, compiler) for compiler in compilers or available()}
+        self._processes = {
+            compiler: subprocess.Popen(
+                [program],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**os.environ, "ASAN_OPTIONS": "detect_leaks=0"},
+            )
+            for compiler, program in programs.items()
+        }
 
     def close(self) -> None:
-        """End the process; it must not have been stopped by a sanitizer."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.close()
-        self._process.stdout.close()
-        assert self._process.wait(20) == 0
+        """End the processes; none must have been stopped by a sanitizer."""
+        for process in self._processes.values():
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.close()
+            process.stdout.close()
+        assert {process.wait(20) for process in self._processes.values()} == {0}
 
     def __enter__(self) -> Kit:
         return self
@@ -118,14 +133,20 @@ class Kit:
         self._commands += command.encode() + struct.pack("<" + form, *values)
 
     def ask(self) -> Reply:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         commands, self._commands = bytes(self._commands), bytearray()
-        self._process.stdin.write(struct.pack("<I", len(commands)) + commands)
-        self._process.stdin.flush()
-        head = self._process.stdout.read(4)
-        assert len(head) == 4, "the program was stopped by a sanitizer"
-        return Reply(self._process.stdout.read(int.from_bytes(head, "little")), self.profile)
+        for process in self._processes.values():
+            assert process.stdin is not None
+            process.stdin.write(struct.pack("<I", len(commands)) + commands)
+            process.stdin.flush()
+        replies: dict[str, bytes] = {}
+        for compiler, process in self._processes.items():
+            assert process.stdout is not None
+            head = process.stdout.read(4)
+            assert len(head) == 4, f"the program of {compiler} was stopped by a sanitizer"
+            replies[compiler] = process.stdout.read(int.from_bytes(head, "little"))
+        first = next(iter(replies.values()))
+        assert all(reply == first for reply in replies.values()), replies
+        return Reply(first, self.profile)
 
     # --- board
 
@@ -158,14 +179,14 @@ class Kit:
         self._commands += data
 
 
-def kits(compiler: str) -> Iterator[Callable[[PatchProfile], Kit]]:
+def kits() -> Iterator[Callable[[PatchProfile], Kit]]:
     """Yield a function that starts the kit of a profile once, and end all of them."""
-    require(compiler)
+    compilers = available()
     running: list[Kit] = []
 
     @functools.cache
     def kit_of(profile: PatchProfile) -> Kit:
-        running.append(Kit(profile, compiler))
+        running.append(Kit(profile, *compilers))
         return running[-1]
 
     yield kit_of

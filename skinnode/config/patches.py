@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -95,7 +94,7 @@ class LayoutConfig(Table):
         """
         if self.file is not None:
             return load_layout(self.file)
-        return _preset(
+        return PatchLayout.preset(
             self.preset,
             pitch_m=self.pitch_m,
             height_m=self.height_m,
@@ -105,16 +104,6 @@ class LayoutConfig(Table):
             lower_electrodes=self.lower_electrodes,
             resistivity_ohm_per_m=self.resistivity_ohm_per_m,
         )
-
-
-@functools.lru_cache(maxsize=256)
-def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
-    """Return a preset layout, from a cache if possible.
-
-    Layouts are immutable, and most patches of a hand have the same layout. Several checks of a hand file need
-    the layout of every patch.
-    """
-    return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
 
 class CalibrationConfig(Table):

@@ -147,7 +147,10 @@ class PatchLayout:
         lower_electrodes: int | None = None,
         resistivity_ohm_per_m: float = 1e7,
     ) -> PatchLayout:
-        """Return a flat layout of a given size.
+        """Return a flat layout of a given size; the same object for the same arguments.
+
+        Layouts are immutable, and the tables of a layout (prior, joint distribution of the readings) are
+        computed once for each object.
 
         - ``aligned``: The lower wires run along y and are evenly spaced in x. Their electrodes are offset
           from the upper wires by a quarter pitch in y, as the figure in Xu et al. 2018 suggests.
@@ -187,21 +190,8 @@ class PatchLayout:
             if count < 1:
                 raise ValueError(f"{label}: got {count}, must be at least 1")
         _require_size(**counts)
-        upper = np.empty((upper_wires, upper_electrodes, 3))
-        upper[..., 0] = np.arange(upper_electrodes)
-        upper[..., 1] = np.arange(upper_wires)[:, None]
-        upper[..., 2] = height_m / pitch_m
-        lower = np.zeros((lower_wires, lower_electrodes, 3))
-        span, index = upper_electrodes - 1.0, np.arange(lower_electrodes)
-        if name == "staggered":
-            lower[..., 0] = np.linspace(-0.25, span + 0.25, lower_wires)[:, None]
-            middle = 0.5 * (upper_wires - 1.0)
-            lower[..., 1] = middle + 1.2 * (index - 0.5 * (lower_electrodes - 1.0))
-            lower[..., 1] += 0.43 * (np.arange(lower_wires) % 3 - 1.0)[:, None]
-        else:
-            lower[..., 0] = np.linspace(0.0, span, lower_wires)[:, None]
-            lower[..., 1] = index + (0.25 if name == "aligned" else 0.0)
-        return cls(upper * pitch_m, lower * pitch_m, resistivity_ohm_per_m, name)
+        upper, lower = (upper_wires, upper_electrodes), (lower_wires, lower_electrodes)
+        return _preset(name, upper, lower, (pitch_m, height_m, resistivity_ohm_per_m))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -238,3 +228,30 @@ class PatchLayout:
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))
+
+
+@functools.lru_cache(maxsize=256)
+def _preset(
+    name: str,
+    upper_size: tuple[int, int],
+    lower_size: tuple[int, int],
+    values: tuple[float, float, float],
+) -> PatchLayout:
+    """Return a preset layout; ``values`` are its pitch (m), height (m) and resistivity (ohm/m)."""
+    (upper_wires, upper_electrodes), (lower_wires, lower_electrodes) = upper_size, lower_size
+    pitch_m, height_m, resistivity_ohm_per_m = values
+    upper = np.empty((upper_wires, upper_electrodes, 3))
+    upper[..., 0] = np.arange(upper_electrodes)
+    upper[..., 1] = np.arange(upper_wires)[:, None]
+    upper[..., 2] = height_m / pitch_m
+    lower = np.zeros((lower_wires, lower_electrodes, 3))
+    span, index = upper_electrodes - 1.0, np.arange(lower_electrodes)
+    if name == "staggered":
+        lower[..., 0] = np.linspace(-0.25, span + 0.25, lower_wires)[:, None]
+        middle = 0.5 * (upper_wires - 1.0)
+        lower[..., 1] = middle + 1.2 * (index - 0.5 * (lower_electrodes - 1.0))
+        lower[..., 1] += 0.43 * (np.arange(lower_wires) % 3 - 1.0)[:, None]
+    else:
+        lower[..., 0] = np.linspace(0.0, span, lower_wires)[:, None]
+        lower[..., 1] = index + (0.25 if name == "aligned" else 0.0)
+    return PatchLayout(upper * pitch_m, lower * pitch_m, resistivity_ohm_per_m, name)

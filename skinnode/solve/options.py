@@ -117,6 +117,13 @@ class PosteriorOptions(EstimateOptions):
         if self.scale_m is not None:
             require_positive("scale_m", self.scale_m)
 
+    @property
+    def kernels(self) -> tuple[object, ...]:
+        """Values of all options that decide which kernels a stream calls."""
+        numbers = "relative_noise", "baseline_ohm", "rubber", "deadline_us"
+        names = [field.name for field in dataclasses.fields(self) if field.name not in numbers]
+        return tuple(getattr(self, name) for name in names)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):

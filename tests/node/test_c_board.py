@@ -20,7 +20,7 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan_check import check_of_codes
 from skinnode.protocol.summary import pack_checked_summary
 
-from ..c_kit import COMPILERS, Kit, kits
+from ..c_kit import Kit, kits
 from .conftest import Desk
 
 OPEN_CIRCUIT = 0xFFFF_FFFF
@@ -32,9 +32,9 @@ WIRES: list[dict[str, Any]] = [{}, {"code_bits": 24}, {"bus": "fd"}, {"bus": "fd
 KitOf = Callable[[PatchProfile], Kit]
 
 
-@pytest.fixture(scope="module", params=COMPILERS)
-def kit_of(request: pytest.FixtureRequest) -> Iterator[KitOf]:
-    yield from kits(request.param)
+@pytest.fixture(scope="module")
+def kit_of() -> Iterator[KitOf]:
+    yield from kits()
 
 
 class Readings:

@@ -14,7 +14,7 @@ from skinnode.canopen.nmt import NmtState
 from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS, Faults
 
-from ..c_kit import COMPILERS, Kit, kits
+from ..c_kit import Kit, kits
 from ..sim.test_faults_in_time import COUNTERS, MS, PERIOD_MS, WIRES, Stream
 from ..sim.test_faults_in_time import IDS as WIRE_IDS
 from ..witness import Witness
@@ -23,15 +23,10 @@ from .test_assembler import GRACE, PERIOD, PROFILES, Frame, ModelNode, falsified
 KitOf = Callable[[PatchProfile], Kit]
 
 
-@pytest.fixture(scope="module", params=COMPILERS)
-def kit_of(request: pytest.FixtureRequest) -> Iterator[KitOf]:
-    """Starts the kit of a profile, once."""
-    yield from kits(request.param)
-
-
 @pytest.fixture(scope="module")
-def gcc_kit_of() -> Iterator[KitOf]:
-    yield from kits("gcc")
+def kit_of() -> Iterator[KitOf]:
+    """Starts the kit of a profile, once."""
+    yield from kits()
 
 
 @settings(deadline=None, max_examples=80)
@@ -113,7 +108,7 @@ COUNTED = {
 
 @pytest.mark.parametrize("wire", WIRES, ids=WIRE_IDS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_every_fault_of_the_simulator(gcc_kit_of: KitOf, fault: str, wire: dict[str, Any]) -> None:
+def test_every_fault_of_the_simulator(kit_of: KitOf, fault: str, wire: dict[str, Any]) -> None:
     """With all chunks, then with only the changed ones."""
     stream, witness = stream_of(wire)
     for mode in (0, 1):
@@ -123,7 +118,7 @@ def test_every_fault_of_the_simulator(gcc_kit_of: KitOf, fault: str, wire: dict[
         stream.node.faults = NO_FAULTS
         run(stream, mode, 6)
     assert getattr(stream.node.injected, COUNTED.get(fault, fault)) > 0
-    assert witness.confront(gcc_kit_of(stream.profile)) > 5
+    assert witness.confront(kit_of(stream.profile)) > 5
 
 
 @pytest.mark.parametrize("wire", WIRES, ids=WIRE_IDS)

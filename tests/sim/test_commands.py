@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from vcan_sim.cli import main
 from vcan_sim.control import ControlError, control_folder, running_simulator
 from vcan_sim.scenes import read_scene
 from vcan_sim.scenes.library import shipped_scenes
@@ -98,16 +99,25 @@ def start(environment: dict[str, str]) -> Iterator[Callable[..., Simulator]]:
         simulator.kill()
 
 
-def vcan_sim(environment: dict[str, str], *arguments: str) -> tuple[int, str, str]:
-    done = subprocess.run(
-        [*COMMAND, *arguments],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
+Ended = tuple[int, str, str]
+"""Exit status, stdout and stderr of a command."""
+
+
+@pytest.fixture
+def vcan_sim(
+    environment: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Ended]:
+    """Run a command in the process of the tests."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", environment["XDG_RUNTIME_DIR"])
+
+    def run(*arguments: str) -> Ended:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main(list(arguments))
+        out, err = capsys.readouterr()
+        return int(ended.value.code or 0), out, err
+
+    return run
 
 
 def until(condition: Callable[[], object]) -> None:
@@ -118,69 +128,79 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def test_inject_from_a_second_process(
-    hand: Path, environment: dict[str, str], start: Callable[..., Simulator]
+    hand: Path,
+    environment: dict[str, str],
+    start: Callable[..., Simulator],
+    vcan_sim: Callable[..., Ended],
 ) -> None:
     simulator = start("run", str(hand))
-    status, out, err = vcan_sim(environment, "inject")
-    assert (status, err) == (0, "")
-    assert out.splitlines() == [f"{place}: none now; nothing so far" for place in ("palm", "thumb", "can0")]
-    status, out, err = vcan_sim(environment, "inject", "palm:unplugged", "can0:rogue_nmt_per_s=50")
+    done = subprocess.run(
+        [*COMMAND, "inject"], capture_output=True, text=True, env=environment, timeout=PATIENCE_S
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == [
+        f"{place}: none now; nothing so far" for place in ("palm", "thumb", "can0")
+    ]
+    status, out, err = vcan_sim("inject", "palm:unplugged", "can0:rogue_nmt_per_s=50")
     assert (status, err) == (0, "")
     assert out.startswith("palm: unplugged now; ")
     assert "\ncan0: rogue_nmt_per_s=50.0 now; " in out
 
     def counted() -> bool:
-        out = vcan_sim(environment, "inject")[1]
+        out = vcan_sim("inject")[1]
         return "palm: unplugged now; " in out and bool(
             re.search(r"1 unplugged", out) and re.search(r"[1-9]\d* rogue_nmt", out)
         )
 
     until(counted)
-    assert vcan_sim(environment, "inject", "none")[1].startswith("palm: none now; ")
+    assert vcan_sim("inject", "none")[1].startswith("palm: none now; ")
     said = simulator.end()
     assert any(line.startswith("palm: ") and "1 unplugged" in line for line in said)
     assert any(line.startswith("can0: ") and "rogue_nmt" in line for line in said)
-    status, out, err = vcan_sim(environment, "inject")
+    status, out, err = vcan_sim("inject")
     assert (status, out) == (2, "")
     assert err == "error: no simulator is running; start one with: vcan-sim run HAND.toml\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("plam:unplugged", "inject: got 'plam', allowed: a patch of the hand: palm, thumb; or a bus: can0"),
-        ("palm:lost=2", "lost: got 2.0, allowed: a fraction from 0 to 1"),
-        ("can0:disturbed=0.1", "only the interface timed"),
-    ],
-)
+BAD_TEXTS = {
+    "plam:unplugged": "inject: got 'plam', allowed: a patch of the hand: palm, thumb; or a bus: can0",
+    "palm:lost=2": "lost: got 2.0, allowed: a fraction from 0 to 1",
+    "can0:disturbed=0.1": "only the interface timed",
+}
+
+
 def test_a_bad_text_is_one_line_and_status_2(
-    text: str, words: str, hand: Path, environment: dict[str, str], start: Callable[..., Simulator]
+    hand: Path, start: Callable[..., Simulator], vcan_sim: Callable[..., Ended]
 ) -> None:
     start(str(hand))
-    status, out, err = vcan_sim(environment, "inject", "thumb:silent", text)
-    assert (status, out) == (2, "")
-    assert err.count("\n") == 1
-    assert words in err
-    assert "none now" in vcan_sim(environment, "inject")[1].splitlines()[1]
+    for text, words in BAD_TEXTS.items():
+        status, out, err = vcan_sim("inject", "thumb:silent", text)
+        assert (status, out) == (2, "")
+        assert err.count("\n") == 1
+        assert words in err
+        assert "none now" in vcan_sim("inject")[1].splitlines()[1]
 
 
 def test_several_simulators_are_told_apart(
-    hand: Path, environment: dict[str, str], start: Callable[..., Simulator]
+    hand: Path,
+    environment: dict[str, str],
+    start: Callable[..., Simulator],
+    vcan_sim: Callable[..., Ended],
 ) -> None:
     first = start(str(hand))
     other = hand.with_name("other.toml")
     other.write_text(hand.read_text().replace("gripper", "foot"))
     second = start(str(other))
-    status, _, err = vcan_sim(environment, "inject", "palm:silent")
+    status, _, err = vcan_sim("inject", "palm:silent")
     assert status == 2
     for simulator, name in ((first, "gripper"), (second, "foot")):
         assert f"{simulator.process.pid} ({name})" in err
-    status, out, _ = vcan_sim(environment, "inject", "palm:silent", "--simulator", "foot")
+    status, out, _ = vcan_sim("inject", "palm:silent", "--simulator", "foot")
     assert (status, out.splitlines()[0].split(";")[0]) == (0, "palm: silent now")
-    out = vcan_sim(environment, "inject", "--simulator", str(first.process.pid))[1]
+    out = vcan_sim("inject", "--simulator", str(first.process.pid))[1]
     assert out.startswith("palm: none now")
     second.kill()  # its socket stays, and is removed
-    out = vcan_sim(environment, "inject")[1]
+    out = vcan_sim("inject")[1]
     assert out.startswith("palm: none now")
     folder = Path(environment["XDG_RUNTIME_DIR"]) / "vcan-sim"
     assert [path.stem for path in folder.iterdir()] == [str(first.process.pid)]
@@ -201,37 +221,37 @@ def test_the_folder_must_be_the_users_own(tmp_path: Path, monkeypatch: pytest.Mo
         control_folder()
 
 
-def test_a_run_is_recorded_and_replayed(hand: Path, environment: dict[str, str]) -> None:
+def test_a_run_is_recorded_and_replayed(hand: Path, vcan_sim: Callable[..., Ended]) -> None:
     folder = hand.with_name("run")
     record = ["run", str(hand), "--record", str(folder), "--fault", "palm:babble_per_s=50", "--seconds", "1"]
-    status, out, err = vcan_sim(environment, *record)
+    status, out, err = vcan_sim(*record)
     assert (status, err) == (0, "")
     assert out.splitlines()[-1] == f"recorded to {folder}"
     assert sorted(path.name for path in folder.iterdir()) == ["faults.jsonl", "trace.log", "truth.npz"]
     frames = (folder / "trace.log").read_text().splitlines()
     assert sum(" 3F0#" in line for line in frames) > 10
     for recording in (folder, folder / "trace.log"):
-        status, out, err = vcan_sim(environment, "replay", str(recording), "--hand", str(hand))
+        status, out, err = vcan_sim("replay", str(recording), "--hand", str(hand))
         assert (status, err) == (0, "")
         assert f"sent {len(frames)} frames in " in out
-    status, out, err = vcan_sim(environment, *record)
+    status, out, err = vcan_sim(*record)
     assert (status, out) == (2, "")
     assert err.startswith("error: --record: got ")
-    status, out, err = vcan_sim(environment, "replay", str(hand.parent))
+    status, out, err = vcan_sim("replay", str(hand.parent))
     assert (status, out) == (2, "")
     assert err.startswith("error: RECORDING: got ")
 
 
-def test_scenes_that_come_with_the_simulator(environment: dict[str, str]) -> None:
-    status, out, err = vcan_sim(environment, "list")
+def test_scenes_that_come_with_the_simulator(vcan_sim: Callable[..., Ended]) -> None:
+    status, out, err = vcan_sim("list")
     assert (status, err) == (0, "")
     assert [line.split()[0] for line in out.splitlines()] == ["faults", "press", "taps"]
     for path in shipped_scenes().values():
         assert read_scene(path).name in out
 
 
-def test_help_names_the_commands(environment: dict[str, str]) -> None:
-    status, out, _ = vcan_sim(environment, "--help")
+def test_help_names_the_commands(vcan_sim: Callable[..., Ended]) -> None:
+    status, out, _ = vcan_sim("--help")
     assert status == 0
     for name in ("run", "inject", "list", "replay"):
         assert name in out

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 HAND = """
 [[buses]]
@@ -89,26 +90,36 @@ def test_that_fails(host):
 """
 
 
+Run = tuple[Path, subprocess.CompletedProcess[str]]
+
+
 def run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     (folder / "hand.toml").write_text(HAND)
     (folder / "press.toml").write_text(SCENE)
     (folder / "test_grip.py").write_text(SUITE)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-rA", *options]
+    without = [f"-pno:{plugin}" for plugin in ("cacheprovider", "xdist", "hypothesispytest", "anyio")]
+    command = [sys.executable, "-m", "pytest", *without, "-rA", *options]
     return subprocess.run(
         command, cwd=folder, env={**os.environ, "PYTEST_ADDOPTS": ""}, capture_output=True, text=True,
         timeout=100, check=False,
     )  # fmt: skip
 
 
-def test_the_same_suite_in_virtual_and_in_real_time(tmp_path: Path) -> None:
-    for options, passed, skipped in (((), 4, 0), (("--skin-bus=virtual",), 2, 2)):
-        done = run(tmp_path, *options)
+@pytest.fixture(scope="module")
+def in_virtual_time(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The whole suite, run once, as no option asks for a bus."""
+    folder = tmp_path_factory.mktemp("virtual")
+    return folder, run(folder)
+
+
+def test_the_same_suite_in_virtual_and_in_real_time(in_virtual_time: Run, tmp_path: Path) -> None:
+    for done, passed, skipped in ((in_virtual_time[1], 4, 0), (run(tmp_path, "--skin-bus=virtual"), 2, 2)):
         assert re.search(rf"1 failed, {passed} passed(, {skipped} skipped)? in", done.stdout), done.stdout
         assert bool(skipped) == ("--skin-bus is virtual" in done.stdout)
 
 
-def test_what_a_failure_keeps(tmp_path: Path) -> None:
-    done = run(tmp_path, "-k", "fails")
+def test_what_a_failure_keeps(in_virtual_time: Run) -> None:
+    tmp_path, done = in_virtual_time
     folder = tmp_path / "skin-kept" / "test_grip.py_test_that_fails"
     kept = "trace.log, truth.npz, scene.json, scene.png"
     assert f"kept in {folder.relative_to(tmp_path)}: {kept}" in done.stdout
@@ -125,15 +136,12 @@ def test_bad_use_is_one_line(tmp_path: Path) -> None:
     done = run(tmp_path, "--skin-bus=wireless")
     assert done.returncode == 4
     assert "--skin-bus" in done.stderr
-    (tmp_path / "test_more.py").write_text("def test_no_hand(skin_host):\n    skin_host()\n")
-    assert "skin_host: there is no hand yet; call skin_hand first" in run(tmp_path, "test_more.py").stdout
-
-
-def test_a_fault_that_is_unknown_or_of_no_patch_is_one_line(tmp_path: Path) -> None:
     test = "def test_{0}(skin_hand, skin_faults):\n    skin_hand('hand.toml')\n    skin_faults.inject({1})\n"
     both = test.format("patch", "'pinky', lost=0.1"), test.format("name", "'palm', loss=0.1")
     (tmp_path / "test_faults.py").write_text("\n\n".join(both))
-    printed = run(tmp_path, "test_faults.py").stdout
+    (tmp_path / "test_more.py").write_text("def test_no_hand(skin_host):\n    skin_host()\n")
+    printed = run(tmp_path, "test_more.py", "test_faults.py").stdout
+    assert "skin_host: there is no hand yet; call skin_hand first" in printed
     assert "ConfigError: patch: got 'pinky', allowed: a patch of the hand: palm" in printed
     assert "ConfigError: loss: got an unknown fault, allowed: one of seed, lost, " in printed
 

@@ -288,16 +288,17 @@ def linear_rank_1_with_zeros(x: Vector) -> Pair:
 
 def chebyquad(x: Vector) -> Pair:
     n, y = x.size, 2 * x - 1
-    r, j = np.zeros_like(x), np.zeros((n, n), x.dtype)
+    values, slopes = np.empty((n, n), x.dtype), np.empty((n, n), x.dtype)
     before, slope_before, value, slope = np.ones_like(y), np.zeros_like(y), y, np.ones_like(y)
-    for i in range(1, n + 1):
-        r[i - 1] = value.mean() + (0 if i % 2 else x.dtype.type(1) / (i * i - 1))
-        j[i - 1] = 2 * slope / n
+    for i in range(n):
+        values[i], slopes[i] = value, slope
         before, slope_before, value, slope = (
             *(value, slope, 2 * y * value - before),
             2 * value + 2 * y * slope - slope_before,
         )
-    return r, j
+    r = values.mean(axis=1)
+    r[1::2] += x.dtype.type(1) / (np.arange(2, n + 1, 2) ** 2 - 1)
+    return r, 2 * slopes / n
 
 
 @dataclass(frozen=True)

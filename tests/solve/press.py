@@ -35,12 +35,12 @@ def hertz_press(
 
 
 def frame_ohm(layout: sk.PatchLayout, displacement_m: np.ndarray) -> np.ndarray:
-    """Resistances (U, K) of a displaced patch, written out wire by wire."""
+    """Resistances (U, K) of a displaced patch, written out for each upper wire."""
     frame = np.empty(layout.shape)
     for u, upper in enumerate(layout.upper_m + displacement_m):
-        for k, lower in enumerate(layout.lower_m):
-            paths = 1 / np.linalg.norm(upper[:, None] - lower[None], axis=-1)
-            frame[u, k] = layout.resistivity_ohm_per_m / paths.sum()
+        x, y, z = (upper[:, None, axis] - layout.lower_m[:, None, :, axis] for axis in range(3))
+        paths = 1 / np.sqrt(x * x + y * y + z * z)
+        frame[u] = layout.resistivity_ohm_per_m / paths.reshape(len(paths), -1).sum(axis=1)
     return frame
 
 

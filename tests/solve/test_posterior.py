@@ -686,6 +686,26 @@ print(digest.hexdigest())
 
 
 @pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"prior": "discs"},
+        {"drift": "patch", "estimate_noise": True, "model_error": 0.01},
+        {"normal_only": True, "hold": False, "scale_m": 1e-4},
+    ],
+    ids=str,
+)
+def test_the_second_patch_of_a_layout_needs_no_warm_up_and_has_the_same_fields(options):
+    preset = sk.PatchLayout.preset("staggered")
+    layout = sk.PatchLayout(preset.upper_m, preset.lower_m, preset.resistivity_ohm_per_m)
+    first, second = sk.Posterior(layout, **options), sk.Posterior(layout, **options)
+    for frame in scenes(layout)[1:4]:
+        field, same = first.update(frame), second.update(frame)
+        for name in ("displacement_m", "displacement_std_m", "residual", "force_n"):
+            np.testing.assert_array_equal(getattr(same, name), getattr(field, name))
+
+
+@pytest.mark.parametrize(
     ("options", "named"),
     [
         ({"drift": "row"}, "drift: got 'row'"),

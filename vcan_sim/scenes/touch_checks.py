@@ -5,6 +5,7 @@ Checks that need no patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tab
 
 from __future__ import annotations
 
+import bisect
 from typing import Final
 
 import numpy as np
@@ -51,12 +52,26 @@ def window_of_touch(
 
 
 def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
-    """Return the poses of the body during a touch and its repetitions, by number of the time step."""
-    return {
-        number: pose_at(each, number * step_s)
-        for each in touch.each
-        for number in range(int(each.from_s / step_s), int(each.to_s / step_s) + 2)
-    }
+    """Return the poses of the body during a touch and its repetitions, by number of the time step.
+
+    While the body is at rest, all time steps have the same pose, so a long touch costs little.
+    """
+    path = {}
+    for each in touch.each:
+        changes = [(each.from_s, each.from_s + each.ramp_s), (each.to_s - each.ramp_s, each.to_s)]
+        changes += [(motion.from_s, motion.to_s) for motion in each.motions]
+        edges = sorted({edge for change in changes for edge in change})
+        resting: dict[int, Pose] = {}
+        for number in range(int(each.from_s / step_s), int(each.to_s / step_s) + 2):
+            t_s = number * step_s
+            interval = bisect.bisect(edges, t_s)
+            pose = resting.get(interval)
+            if pose is None:
+                pose = pose_at(each, t_s)
+                if not any(from_s <= t_s < to_s for from_s, to_s in changes):
+                    resting[interval] = pose
+            path[number] = pose
+    return path
 
 
 def check_on_patch(  # noqa: PLR0913 - all inputs of the check
@@ -80,9 +95,10 @@ def check_on_patch(  # noqa: PLR0913 - all inputs of the check
         f"x from {low[0]:.4g} to {high[0]:.4g}, y from {low[1]:.4g} to {high[1]:.4g} m on {touch.patch!r}, "
         "so that the contact stays on the patch"
     )
+    (low_x, low_y), (high_x, high_y) = (low - 1e-9).tolist(), (high + 1e-9).tolist()
     for step, pose in path.items():
-        place = np.array(pose.place_m)
-        if ((place >= low - 1e-9) & (place <= high + 1e-9)).all():
+        place = x, y = pose.place_m
+        if low_x <= x <= high_x and low_y <= y <= high_y:
             continue
         key, got = f"touches[{number}].at_m", list(touch.at_m)
         t = step * scene.step_s

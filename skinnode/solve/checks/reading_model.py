@@ -24,7 +24,7 @@ import numpy as np
 from skinnode.compiled.jit import njit
 from skinnode.model.forward import jacobian, potential_per_m
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.checks.wire_tests import WireTables
+from skinnode.solve.checks.wire_tests import WireTables, wire_blocks
 from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior, bonded_response
 
@@ -156,10 +156,17 @@ class ReadingModel:
     def _compute(self, number: int) -> Level:
         upper, lower = self.shape
         m = upper * lower
-        precision, covariance, weighted = np.empty((3, m, m))
+        precision, weighted = np.empty((2, m, m))
+        covariance = np.full((m, m), np.nan)  # only the blocks of the wires are needed, and computed
         vectors = np.ascontiguousarray(self.vectors_t.T)
         np.divide(self.vectors_t, self.shrink[number][:, None], out=weighted)
-        multiply(vectors, weighted, covariance)
+        of_upper, of_lower = wire_blocks(covariance, self.shape)
+        for wires, first, step in ((of_upper, lower, 1), (of_lower, 1, lower)):
+            block = np.empty(wires.shape[1:])
+            for wire, each in enumerate(wires):
+                rows = slice(wire * first, wire * first + len(block) * step, step)
+                multiply(np.ascontiguousarray(vectors[rows]), np.ascontiguousarray(weighted[:, rows]), block)
+                each[...] = block
         np.multiply(self.vectors_t, self.shrink[number][:, None], out=weighted)
         multiply(vectors, weighted, precision)
         return Level(

@@ -56,21 +56,45 @@ class WireTables:
 
     @classmethod
     def of(cls, p: Float, s: Float, shape: tuple[int, int]) -> WireTables:
-        """Compute the tables from the precision ``p`` (m, m) and the covariance ``s`` (m, m)."""
-        upper, lower = shape
-        blocks = [np.arange(u * lower, (u + 1) * lower) for u in range(upper)]
-        blocks += [np.arange(k, upper * lower, lower) for k in range(lower)]
-        of_p = [np.linalg.cholesky(p[np.ix_(b, b)] + LEAST * np.eye(len(b))) for b in blocks]
-        of_s = [np.linalg.cholesky(s[np.ix_(b, b)]) for b in blocks]
+        """Compute the tables from the precision ``p`` (m, m) and the covariance ``s`` (m, m).
+
+        Reads only the wires' blocks of both matrices (:func:`wire_blocks`).
+        """
+        of_p = [_factors(each + LEAST * np.eye(each.shape[-1])) for each in wire_blocks(p, shape)]
+        of_s = [_factors(each) for each in wire_blocks(s, shape)]
         return cls(
-            upper_p=np.stack(of_p[:upper]),
-            upper_s=np.stack(of_s[:upper]),
-            lower_p=np.stack(of_p[upper:]),
-            lower_s=np.stack(of_s[upper:]),
-            log_det_p=np.array([np.log(np.diag(each)).sum() for each in of_p]),
-            log_det_s=np.array([np.log(np.diag(each)).sum() for each in of_s]),
-            sums=np.array([(each.sum(axis=0) ** 2).sum() for each in of_p]),
+            upper_p=of_p[0],
+            upper_s=of_s[0],
+            lower_p=of_p[1],
+            lower_s=of_s[1],
+            log_det_p=np.concatenate([_half_log_det(each) for each in of_p]),
+            log_det_s=np.concatenate([_half_log_det(each) for each in of_s]),
+            sums=np.concatenate([(each.sum(axis=1) ** 2).sum(axis=1) for each in of_p]),
         )
+
+
+def wire_blocks(matrix: Float, shape: tuple[int, int]) -> tuple[Float, Float]:
+    """Return the blocks of each wire in a matrix (m, m) of the readings, as writable views.
+
+    Args:
+        matrix: (m, m) C-ordered matrix, m = U K.
+        shape: Number of upper wires U and of lower wires K.
+
+    Returns:
+        (U, K, K) blocks of the upper wires, and (K, U, U) blocks of the lower wires.
+    """
+    of_pairs = matrix.reshape(*shape, *shape)
+    return np.einsum("ukul->ukl", of_pairs), np.einsum("ukvk->kuv", of_pairs)
+
+
+def _factors(blocks: Float) -> Float:
+    """Return the Cholesky factors (B, n, n) of the matrices ``blocks`` (B, n, n)."""
+    return np.asarray(np.linalg.cholesky(blocks), np.float64)
+
+
+def _half_log_det(factors: Float) -> Float:
+    """Return ½ ln det A of each matrix A, given the Cholesky factors (B, n, n)."""
+    return np.asarray(np.log(np.diagonal(factors, axis1=1, axis2=2).copy()).sum(axis=1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ Each frame passes through these steps:
 from __future__ import annotations
 
 import math
+import weakref
 from typing import Final, Unpack
 
 import numpy as np
@@ -55,6 +56,9 @@ compute their standard deviations. Measured solves of presses on 1 to 10 wires t
 this computation."""
 
 Mask = NDArray[np.bool_]
+
+_WARM: Final[weakref.WeakKeyDictionary[PatchLayout, set[tuple[object, ...]]]] = weakref.WeakKeyDictionary()
+"""Options for which the kernels have been compiled, by layout."""
 
 
 class FrameEstimator:
@@ -130,8 +134,13 @@ class FrameEstimator:
     def warm_up(self) -> None:
         """Compile the kernels by solving a touched frame, so that the first touch in a stream is not delayed.
 
-        If a deadline is set, this method also measures :attr:`from_rest_s`.
+        A second patch with the same layout and options uses the same kernels and needs no solve. If a
+        deadline is set, this method also measures :attr:`from_rest_s`.
         """
+        warm = _WARM.setdefault(self.layout, set())
+        kernels = self.options.kernels
+        if kernels in warm and self._seconds == math.inf:
+            return
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
@@ -148,6 +157,7 @@ class FrameEstimator:
             at_rest = self._observe(Readings(a, np.ones_like(a), np.ones_like(a, bool)))
             self.from_rest_s = LEAST_STEPS * self._estimator.step_s(at_rest)
             self._forget()
+        warm.add(kernels)
 
     def reset(self) -> None:
         """Discard the state of the stream; the next frame is solved from rest."""

@@ -5,6 +5,7 @@
 #   sh install.sh mcap     what a robot needs, and recordings as MCAP
 #   sh install.sh parquet  what a robot needs, and tables of fields as Parquet
 #   sh install.sh view     what a robot needs, and the three-dimensional view (770 MB)
+#   sh install.sh zenoh    what a robot needs, and fields for other processes over Zenoh
 #   sh install.sh bench    what a robot needs, and Ceres to measure against
 #   sh install.sh test     the first, editable, with everything the tests use
 # Needs Python 3.11 or newer (PYTHON=... chooses one). On a Debian without the venv module it installs that first.
@@ -13,8 +14,8 @@ cd "$(dirname "$0")"
 python=${PYTHON:-python3}
 extra=${1:-plot}
 case $extra in
-    plot | tui | view | mcap | parquet | bench | test) ;;
-    *) echo "install.sh: got $extra, allowed: plot, tui, view, mcap, parquet, bench or test" >&2; exit 2 ;;
+    plot | tui | view | mcap | parquet | zenoh | bench | test) ;;
+    *) echo "install.sh: got $extra, allowed: plot, tui, view, mcap, parquet, zenoh, bench or test" >&2; exit 2 ;;
 esac
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
@@ -33,5 +34,5 @@ if [ ! -x .venv/bin/pip ]; then
 fi
 case $extra in
     test) .venv/bin/pip install --quiet --editable '.[test]' ;;
-    plot | tui | view | mcap | parquet | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
+    plot | tui | view | mcap | parquet | zenoh | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
 esac

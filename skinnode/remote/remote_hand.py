@@ -267,6 +267,9 @@ class RemoteHand:
             self._publisher.publish(field, stamp.patch)
 
     def _on_report(self, report: HealthReport) -> None:
+        buses = {bus.name for bus in self.hand.buses if self.hand.patches_on(bus.name)}
+        if set(report.patches) != set(self._accounts) or set(report.buses) != buses:
+            raise ValueError("a report of the health of another hand")
         self._report, self._t_report_ns = report, clock.monotonic_ns()
         for name, published in report.published.items():
             self._accounts[name].published = published

@@ -58,7 +58,7 @@ def test_topics_are_valid_names_and_differ() -> None:
     topics = HandTopics.of(parse_hand({"name": "left hand", "buses": [bus], "patches": patches}))
     found = [topics.events, topics.journal, *topics.buses["can-0"]]
     found += [topic for each in topics.patches.values() for topic in each]
-    assert len(found) == len(set(found)) == 2 + 4 + 4 * len(names)
+    assert len(found) == len(set(found)) == 2 + 4 + 5 * len(names)
     for topic in found:
         assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic), topic
         assert "__" not in topic

@@ -34,7 +34,7 @@ class Description:
     """Facts about a published hand that do not change while it runs."""
 
     hand: HandConfig
-    """Configuration of the hand, without the names of files."""
+    """Configuration of the hand, without the names of files; a program sees ``guest_sends`` as ``sdo``."""
     layouts: Mapping[str, PatchLayout]
     """Electrode layout of each patch, by patch name."""
     boot_id: str
@@ -55,7 +55,7 @@ class Description:
         }
         table = {
             "versions": _VERSIONS,
-            "header": Header(self.hand, "", 0).line(),
+            "header": Header(_portable(self.hand), "", 0).line(),
             "layouts": layouts,
             "boot_id": self.boot_id,
             "commands": self.commands,
@@ -107,6 +107,14 @@ def ask(session: zenoh.Session, hand: str) -> Description | None:
         if reply.ok is not None:
             return Description.decode(reply.ok.payload.to_bytes(), hand)
     return None
+
+
+def _portable(hand: HandConfig) -> HandConfig:
+    """Return the hand without a setting that is valid only with a baseline file, which programs do not have."""
+    buses = tuple(
+        bus.model_copy(update={"guest_sends": "sdo"}) if bus.role == "guest" else bus for bus in hand.buses
+    )
+    return hand.model_copy(update={"buses": buses})
 
 
 def _layout(table: Mapping[str, Any]) -> PatchLayout:

@@ -39,7 +39,8 @@ class Output:
     @property
     def wanted(self) -> bool:
         """Whether any program subscribes to the topic."""
-        return bool(self._publisher.matching_status.matching)
+        status: object = self._publisher.matching_status  # not a bool, as the stubs say
+        return bool(getattr(status, "matching", status))
 
     def send(self, data: bytes, sent_ns: int) -> None:
         """Publish a message. Never waits.

@@ -187,7 +187,7 @@ class RemoteHand:
             SkinError: if the daemon accepts no commands, or does not reply in time.
         """
         default_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
-        request = {"command": "tare", "patch": patch, "deadline_s": deadline_s}
+        request: dict[str, object] = {"command": "tare", "patch": patch, "deadline_s": deadline_s}
         self._command(request, default_s if deadline_s is None else deadline_s)
 
     def reset_node(self, patch: str) -> None:

@@ -133,7 +133,16 @@ def _total(rows: list[Row]) -> Row:
     """Return the sums of the counters and the percentiles of all times."""
     sums = {
         key: sum(row[key] for row in rows)
-        for key in ("seconds", "solved", "skipped", "sent", "daemon_dropped", "received", "lost", "unaccounted")
+        for key in (
+            "seconds",
+            "solved",
+            "skipped",
+            "sent",
+            "daemon_dropped",
+            "received",
+            "lost",
+            "unaccounted",
+        )
     }
     times = {key: spread(rows, key) for key in ("solved_to_program_ms", "sent_to_program_ms", "ping_ms")}
     for row in rows:
@@ -217,5 +226,7 @@ def line(row: Row) -> str:
     for key, name in names.items():
         times = row[key]
         if times:
-            text += f"\n  {name:36} p50 {times['p50']:7.2f}  p99 {times['p99']:7.2f}  max {times['max']:8.2f} ms"
+            text += (
+                f"\n  {name:36} p50 {times['p50']:7.2f}  p99 {times['p99']:7.2f}  max {times['max']:8.2f} ms"
+            )
     return text

@@ -78,7 +78,11 @@ def host(
 
 
 def _run(
-    plan: HandConfig, seconds: float | None, report: Report, stop: threading.Event, published: AskedPublication
+    plan: HandConfig,
+    seconds: float | None,
+    report: Report,
+    stop: threading.Event,
+    published: AskedPublication,
 ) -> int:
     """Run the hand until the host is stopped or the duration has elapsed, and return the exit status.
 

@@ -374,7 +374,9 @@ class Host:
         """
         node = self._nodes[patch]
         if node.has_other_master:
-            raise NodeError(node.patch.node_id, f"another master runs {node.patch.bus}; it must reset the node")
+            raise NodeError(
+                node.patch.node_id, f"another master runs {node.patch.bus}; it must reset the node"
+            )
         nmt_master.reset(node.link.send, node.patch.node_id)
 
     def stats(self) -> HostStats:

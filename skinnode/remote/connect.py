@@ -80,7 +80,9 @@ def _described(
             break
         clock.sleep(_POLL_S)
     if present:
-        raise SkinError(f"hand {hand!r}: its daemon is starting and has not described the hand; connect again")
+        raise SkinError(
+            f"hand {hand!r}: its daemon is starting and has not described the hand; connect again"
+        )
     others = published_hands(session)
     if others:
         raise ConfigError("hand", hand, f"one of the published hands: {', '.join(map(repr, others))}")

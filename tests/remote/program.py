@@ -1,6 +1,6 @@
 """Program: connects to a hand, and answers each line on standard input with its counters.
 
-    program.py NAME PORT [ROUTER]
+program.py NAME PORT [ROUTER]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Program: a Zenoh router on an endpoint, until its standard input ends.
 
-    router.py '{"listen": …}'
+router.py '{"listen": …}'
 """
 
 from __future__ import annotations

@@ -124,7 +124,10 @@ def test_a_wrong_name_lists_the_hands(start: Callable[..., Process], port: int) 
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("my hand", "name: got 'my hand', allowed: a hand that no other daemon publishes"), ("my-hand", "'my hand'")],
+    [
+        ("my hand", "name: got 'my hand', allowed: a hand that no other daemon publishes"),
+        ("my-hand", "'my hand'"),
+    ],
 )
 def test_a_hand_has_one_daemon(start: Callable[..., Process], name: str, said: str) -> None:
     start(name="my hand").wait_until_up()

@@ -45,7 +45,8 @@ def connect(
         port: First port of the daemons on this machine.
 
     Raises:
-        ConfigError: if no such hand is published in time, an option is invalid, or a package is missing.
+        ConfigError: if no such hand is published in time, the router does not answer, an option is invalid,
+            or a package is missing.
         SkinError: if the daemon does not describe the hand in time, or has another version of skinnode.
         ValueError: if ``timeout_s`` is out of range.
     """
@@ -53,7 +54,7 @@ def connect(
     require_zenoh("connect")
     options = SessionOptions(router, None, None if config is None else Path(config), port)
     end_s = None if timeout_s is None else clock.monotonic() + timeout_s
-    session = open_program(options)
+    session = open_program(options, end_s)
     try:
         remote = RemoteHand(session, _described(session, hand, end_s, options))
     except BaseException:

@@ -40,6 +40,10 @@ _QUEUED: Final = 16
 fields of 16 patches, which are solved at the same time."""
 _SETTLE_S: Final = 1.0
 """Time limit for connections to the other daemons and to the router at the start, s."""
+_ROUTER_MS: Final = 500
+"""Time limit of one attempt of a program to connect to a router, ms."""
+_PAUSE_S: Final = 0.1
+"""Pause between these attempts, s."""
 _POLL_S: Final = 0.01
 _ENDPOINT: Final = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[^\]]+\]|[^/:\[\]]+):(\d{1,5})((?:[?#].*)?)")
 
@@ -153,11 +157,17 @@ def open_daemon(options: SessionOptions) -> zenoh.Session:
     raise ConfigError("--port", options.port, f"a free port of {options.port} to {last} (all are {taken})")
 
 
-def open_program(options: SessionOptions) -> zenoh.Session:
-    """Open the session of a program. The connection is made, and made again, in the background.
+def open_program(options: SessionOptions, end_s: float | None) -> zenoh.Session:
+    """Open the session of a program. A connection that is lost is made again in the background.
+
+    Without a router, daemons may appear later. With a router, wait until it answers.
+
+    Args:
+        options: Connections of the program.
+        end_s: Monotonic time until which to wait for the router, s; None for no limit.
 
     Raises:
-        ConfigError: if the configuration is invalid.
+        ConfigError: if the configuration is invalid, or the router does not answer in time.
     """
     import zenoh
 
@@ -166,10 +176,17 @@ def open_program(options: SessionOptions) -> zenoh.Session:
         settings = {"mode": "peer", "listen": _ends(), "connect": _ends(*map(_local, ports))}
     else:
         settings = {"mode": "client", "listen": _ends(), "connect": _ends(options.router)}
-    try:
-        return zenoh.open(_config(options, settings))
-    except zenoh.ZError as error:
-        raise _refused(options, error) from None
+    config = _config(options, settings)
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if options.router is None:
+                raise _refused(options, error) from None
+            if end_s is not None and clock.monotonic() >= end_s:
+                allowed = f"an endpoint where a router or daemon answers ({_first_line(error)})"
+                raise ConfigError("router", options.router, allowed) from None
+        clock.sleep(_PAUSE_S)
 
 
 def _config(options: SessionOptions, settings: dict[str, Any]) -> zenoh.Config:
@@ -185,7 +202,7 @@ def _config(options: SessionOptions, settings: dict[str, Any]) -> zenoh.Config:
         "listen/endpoints": settings["listen"],
         "listen/exit_on_failure": True,
         "connect/endpoints": settings["connect"],
-        "connect/timeout_ms": 0 if settings["mode"] == "peer" else -1,
+        "connect/timeout_ms": 0 if settings["mode"] == "peer" else _ROUTER_MS,
         "connect/exit_on_failure": False,
         "connect/retry": _RETRY,
         "scouting/multicast/enabled": False,

@@ -202,9 +202,10 @@ def _config(options: SessionOptions, settings: dict[str, Any]) -> zenoh.Config:
         "listen/endpoints": settings["listen"],
         "listen/exit_on_failure": True,
         "connect/endpoints": settings["connect"],
-        "connect/timeout_ms": 0 if settings["mode"] == "peer" else _ROUTER_MS,
+        "connect/timeout_ms": -1 if settings["mode"] == "peer" else _ROUTER_MS,
         "connect/exit_on_failure": False,
         "connect/retry": _RETRY,
+        "open/return_conditions/connect_scouted": False,  # do not wait for peers that are not there
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
         "transport/link/tx/queue/size/data": _QUEUED,

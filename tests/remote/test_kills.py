@@ -67,6 +67,16 @@ def test_a_stopped_program_harms_nobody(
         eventually(lambda: counts(stopped)["away"] is None)
 
 
+def test_a_program_may_start_before_the_daemon(
+    start: Callable[..., Process], run: Callable[..., Process], port: int
+) -> None:
+    program = run("program.py", "hand", str(port))
+    daemon = start()  # both take about as long to load; the daemon then brings up its hand
+    daemon.wait_until_up()
+    program.wait_until_up()
+    eventually(lambda: counts(program)["patches"]["p1"]["received"] > 5)
+
+
 def test_the_daemon_is_killed_and_returns(start: Callable[..., Process], port: int) -> None:
     daemon = start().wait_until_up()
     with sk.connect("hand", port=port) as hand:

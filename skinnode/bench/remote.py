@@ -115,8 +115,9 @@ def _unaccounted(published: dict[str, int], followed: Row) -> Row:
     """Compare the sequence numbers at both ends.
 
     Returns:
-        ``received``, ``lost`` (gaps found by the program) and ``unaccounted``: fields that the daemon has sent
-        after the program's first field of the patch and that the program neither received nor counted as lost.
+        ``received``, ``lost`` (gaps found by the program) and ``unaccounted``: fields that the daemon has
+        sent since the program's first field of the patch, and that the program neither received nor counted
+        as lost.
     """
     counts = followed.get("counts", {})
     unaccounted = sum(

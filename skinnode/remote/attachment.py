@@ -1,4 +1,4 @@
-"""Encodes the sequence number, time and publisher of a message as rmw_zenoh does (``attachment_helpers.cpp``).
+"""Encodes the number, time and publisher of a message as rmw_zenoh does (``attachment_helpers.cpp``).
 
 The layout is that of Zenoh's serialization: two little-endian int64, then the length and the 16 bytes of the
 publisher's ID.

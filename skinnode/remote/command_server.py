@@ -1,7 +1,7 @@
 """Executes the commands of programs on a host, one after the other, in a separate thread.
 
-A request is JSON with ``command`` (``tare`` or ``reset_node``), ``patch`` and, for a tare, ``deadline_s``. The
-reply is empty, or an error as JSON with ``kind``, ``node_id`` and ``text``.
+A request is JSON with ``command`` (``tare`` or ``reset_node``), ``patch`` and, for a tare, ``deadline_s``.
+The reply is empty, or an error as JSON with ``kind``, ``node_id`` and ``text``.
 """
 
 from __future__ import annotations

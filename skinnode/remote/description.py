@@ -110,7 +110,7 @@ def ask(session: zenoh.Session, hand: str) -> Description | None:
 
 
 def _portable(hand: HandConfig) -> HandConfig:
-    """Return the hand without a setting that is valid only with a baseline file, which programs do not have."""
+    """Return the hand without a setting that requires a baseline file, which programs do not have."""
     buses = tuple(
         bus.model_copy(update={"guest_sends": "sdo"}) if bus.role == "guest" else bus for bus in hand.buses
     )

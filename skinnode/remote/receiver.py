@@ -142,7 +142,7 @@ class Receiver:
         self._events_of = gid, sequence
 
     def _offset_ns(self, wall_minus_mono_ns: int) -> int:
-        """Return this machine's monotonic clock minus the host's, ns; from the wall clocks of two machines."""
+        """Return this machine's monotonic clock minus the host's, ns, from the wall clocks of both."""
         if self._same_clock:
             return 0
         return wall_minus_mono_ns - (clock.time_ns() - clock.monotonic_ns())

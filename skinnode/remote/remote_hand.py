@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import zenoh
 
 SILENT_S: Final = 1.0
-"""Time without a report of the health, s, after which the daemon counts as silent; it sends four per second."""
+"""Time without a report of the health, s, after which the daemon counts as silent; it sends four a second."""
 _RESET_S: Final = 1.0
 
 

@@ -76,9 +76,9 @@ class SessionOptions:
     def exposed(self) -> str | None:
         """Endpoint that leaves this machine without TLS; None if there is none."""
         for option, endpoint in (("--router", self.router), ("--listen", self.listen)):
-            if endpoint is not None and not endpoint.startswith(("tls/", "quic/")):
-                if not _is_local(host_of(option, endpoint)):
-                    return endpoint
+            encrypted = endpoint is None or endpoint.startswith(("tls/", "quic/"))
+            if endpoint is not None and not encrypted and not _is_local(host_of(option, endpoint)):
+                return endpoint
         return None
 
 

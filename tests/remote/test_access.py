@@ -31,7 +31,7 @@ def test_only_the_operator_commands_and_only_with_a_certificate(
 
     with sk.connect("hand", router=endpoint, config=certificates.config(tmp_path, "guest")) as hand:
         assert hand.fields().get(30.0) is not None
-        with pytest.raises(SkinError, match="no reply to tare within 2 s.*access control"):
+        with pytest.raises(SkinError, match=r"no reply to tare within 2 s.*access control"):
             hand.tare("p0", deadline_s=0.0)
         assert json.loads(daemon.tell("baselines"))["p0"] == 0
     with sk.connect("hand", router=endpoint, config=certificates.config(tmp_path, "operator")) as hand:
@@ -43,7 +43,7 @@ def test_only_the_operator_commands_and_only_with_a_certificate(
     certificates.make(stranger, "operator")  # the right name, signed by another authority
     (stranger / "ca.pem").write_bytes((tmp_path / "ca.pem").read_bytes())
     for unknown in (certificates.config(stranger, "operator"), None):
-        with pytest.raises(ConfigError, match="router: got .*a router or daemon answers"):
+        with pytest.raises(ConfigError, match=r"router: got .*a router or daemon answers"):
             sk.connect("hand", router=endpoint, config=unknown, timeout_s=1.0)
 
 
@@ -62,7 +62,7 @@ def test_only_the_operator_commands_and_only_with_a_certificate(
 def test_commands_leave_the_machine_only_by_tls(options: dict[str, str], refused: bool) -> None:
     if refused:
         with pytest.raises(
-            ConfigError, match="--commands: got .*, allowed: only with endpoints of this machine"
+            ConfigError, match=r"--commands: got .*, allowed: only with endpoints of this machine"
         ):
             require_protected(SessionOptions(**options), commands=True)
     else:
@@ -72,7 +72,7 @@ def test_commands_leave_the_machine_only_by_tls(options: dict[str, str], refused
 
 @pytest.mark.parametrize("endpoint", ["", "robot", "tcp/robot", "tcp/robot:0", "tcp/robot:99999", "a/b:1"])
 def test_a_malformed_endpoint_is_refused(endpoint: str) -> None:
-    with pytest.raises(ConfigError, match="--router: got .*, allowed: an endpoint such as tcp/"):
+    with pytest.raises(ConfigError, match=r"--router: got .*, allowed: an endpoint such as tcp/"):
         SessionOptions(router=endpoint)
 
 

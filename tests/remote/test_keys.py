@@ -1,4 +1,4 @@
-"""Keys and attachments, held against examples in the design document of rmw_zenoh and against Zenoh itself."""
+"""Keys and attachments, held against the design document of rmw_zenoh and against Zenoh itself."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_keys_are_those_of_rmw_zenoh(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("text", ["-1", "233", "1.5", "x", "1/2"])
 def test_a_wrong_domain_is_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", text)
-    with pytest.raises(ConfigError, match="ROS_DOMAIN_ID: got .*, allowed: an integer from 0 to 232"):
+    with pytest.raises(ConfigError, match=r"ROS_DOMAIN_ID: got .*, allowed: an integer from 0 to 232"):
         keys.domain()
 
 
@@ -45,7 +45,7 @@ def test_attachments_are_those_of_zenoh() -> None:
         assert Attachment(sequence, sent_ns, gid).encode() == theirs
         assert Attachment.decode(theirs) == (sequence, sent_ns, gid)
     for wrong in (b"", b"x" * 32, b"x" * 33, b"x" * 34):
-        with pytest.raises(ValueError, match="attachment"):
+        with pytest.raises(ValueError, match=r"attachment"):
             Attachment.decode(wrong)
 
 

@@ -44,7 +44,8 @@ def test_a_program_is_killed(start: Callable[..., Process], run: Callable[..., P
             eventually(lambda: counts(victim)["patches"]["p0"]["received"] > 5)
             assert received(hand) > before
         assert [each.lost for each in hand.stats().patches.values()] == [0, 0]
-        assert hand.away is None and json.loads(daemon.tell("stats"))["dropped"] == 0
+        assert hand.away is None
+        assert json.loads(daemon.tell("stats"))["dropped"] == 0
 
 
 def test_a_stopped_program_harms_nobody(
@@ -58,12 +59,14 @@ def test_a_stopped_program_harms_nobody(
         before = received(hand)
         eventually(lambda: received(hand) > before + 250)  # for longer than the lease of the connection
         stats = json.loads(daemon.tell("stats"))
-        assert [each.lost for each in hand.stats().patches.values()] == [0, 0] and stats["dropped"] == 0
+        assert [each.lost for each in hand.stats().patches.values()] == [0, 0]
+        assert stats["dropped"] == 0
         stopped.process.send_signal(signal.SIGCONT)
         seen = counts(stopped)["patches"]["p0"]["sequence"]
         eventually(lambda: counts(stopped)["patches"]["p0"]["sequence"] > seen + 20)
         each = counts(stopped)["patches"]["p0"]
-        assert each["runs"] == 1 and each["received"] + each["lost"] <= each["sequence"]
+        assert each["runs"] == 1
+        assert each["received"] + each["lost"] <= each["sequence"]
         eventually(lambda: counts(stopped)["away"] is None)
 
 
@@ -86,7 +89,8 @@ def test_the_daemon_is_killed_and_returns(start: Callable[..., Process], port: i
         eventually(lambda: hand.away is not None, 2.0)
         assert "no daemon has published hand 'hand' for" in str(hand.away)
         health = hand.health("p0")
-        assert health.condition is Condition.LOST and "no daemon" in health.reason
+        assert health.condition is Condition.LOST
+        assert "no daemon" in health.reason
         assert "no daemon" in str(hand.bus_health("can0").away)
         while fields.get(0.1) is not None:  # waits, and does not end
             pass
@@ -119,6 +123,7 @@ def test_the_router_is_killed_and_returns(
         eventually(lambda: far.stats().patches["p0"].received > missing.received + 10)
         eventually(lambda: far.away is None)
         each = far.stats().patches["p0"]
-        assert each.lost >= 15 and each.runs == 1
+        assert each.lost >= 15
+        assert each.runs == 1
         assert each.received + each.lost == each.sequence - missing.sequence + missing.received + missing.lost
         assert [each.lost for each in near.stats().patches.values()] == [0, 0]

@@ -25,6 +25,7 @@ from skinnode.bench.pipeline import STAGGER_MS, full_hand
 from skinnode.bench.remote_programs import follow, ping, pong, until_closed
 from skinnode.bench.timing import machine
 from skinnode.config import HandConfig
+from skinnode.errors import SkinError
 from skinnode.host import Host
 from skinnode.messages.full_field import SendStamp, encode_field
 from skinnode.process.child_processes import starting_children
@@ -85,7 +86,7 @@ def _measure(hand: HandConfig, generator: Generator, *, connected: bool) -> Row:
         pinger = stack.enter_context(_child(ping, PING_PORT, _payload_bytes(hand))) if connected else None
         for child in (program, echo, pinger):
             if child is not None:
-                child.recv()  # ready
+                _received(child)  # ready
         generator.begin()
         time.sleep(LEAD_S / 2)
         begin_s, cpu_s = time.monotonic(), time.process_time()
@@ -206,9 +207,18 @@ def _child(program: Callable[..., None], *arguments: Any) -> Iterator[Connection
 def _answer(pipe: Connection | None) -> Row:
     if pipe is None:
         return {}
-    pipe.send("end")
-    answer: Row = pipe.recv()
+    with contextlib.suppress(OSError):
+        pipe.send("end")
+    answer: Row = _received(pipe)
     return answer
+
+
+def _received(pipe: Connection) -> Any:
+    """Return the next message of a child process. Raises SkinError if the process has ended."""
+    try:
+        return pipe.recv()
+    except (EOFError, OSError):
+        raise SkinError("a process of the benchmark ended unexpectedly; see its message above") from None
 
 
 def line(row: Row) -> str:

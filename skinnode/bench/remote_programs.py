@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 PING_S: Final = 0.01
 """Interval between pings, s."""
+_LONGEST_S: Final = 10.0
+"""Time after which a ping without an echo ends the benchmark, s."""
 _PING, _PONG = "skinnode-bench/ping", "skinnode-bench/pong"
 
 
@@ -76,7 +78,7 @@ def ping(pipe: Connection, port: int, payload_bytes: int) -> None:
         while not pipe.poll(PING_S):
             begin_ns = time.monotonic_ns()
             publisher.put(data)
-            times_ms.append((arrived.get() - begin_ns) * 1e-6)
+            times_ms.append((arrived.get(timeout=_LONGEST_S) - begin_ns) * 1e-6)
     pipe.recv()
     pipe.send({"round_trip_ms": times_ms})
 

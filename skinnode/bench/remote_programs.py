@@ -73,7 +73,8 @@ def ping(pipe: Connection, port: int, payload_bytes: int) -> None:
             _PING, congestion_control=zenoh.CongestionControl.BLOCK, express=True
         )
         while not _echoed(publisher, data, arrived):
-            pass
+            if pipe.poll():  # the parent has ended
+                return
         pipe.send("ready")
         while not pipe.poll(PING_S):
             begin_ns = time.monotonic_ns()
@@ -115,7 +116,7 @@ def _session(settings: dict[str, Any]) -> zenoh.Session:
         "mode": "peer",
         "scouting/multicast/enabled": False,
         "listen/endpoints": [],
-        "connect/timeout_ms": 0,
+        "connect/timeout_ms": -1,  # the echo may start later
         "connect/exit_on_failure": False,
     }
     for key, value in {**fixed, **settings}.items():

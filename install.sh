@@ -6,6 +6,7 @@
 #   sh install.sh parquet  what a robot needs, and tables of fields as Parquet
 #   sh install.sh cluster  what a robot needs, and skinnode resolve on a Dask cluster
 #   sh install.sh view     what a robot needs, and the three-dimensional view (770 MB)
+#   sh install.sh zenoh    what a robot needs, and fields for other processes over Zenoh
 #   sh install.sh bench    what a robot needs, and Ceres to measure against
 #   sh install.sh test     the first, editable, with everything the tests use
 # Needs Python 3.11 or newer (PYTHON=... chooses one). On a Debian without the venv module it installs that first.
@@ -14,8 +15,8 @@ cd "$(dirname "$0")"
 python=${PYTHON:-python3}
 extra=${1:-plot}
 case $extra in
-    plot | tui | view | mcap | parquet | cluster | bench | test) ;;
-    *) echo "install.sh: got $extra, allowed: plot, tui, view, mcap, parquet, cluster, bench or test" >&2; exit 2 ;;
+    plot | tui | view | mcap | parquet | cluster | zenoh | bench | test) ;;
+    *) echo "install.sh: got $extra, allowed: plot, tui, view, mcap, parquet, cluster, zenoh, bench or test" >&2; exit 2 ;;
 esac
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
@@ -34,5 +35,5 @@ if [ ! -x .venv/bin/pip ]; then
 fi
 case $extra in
     test) .venv/bin/pip install --quiet --editable '.[test]' ;;
-    plot | tui | view | mcap | parquet | cluster | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
+    plot | tui | view | mcap | parquet | cluster | zenoh | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
 esac

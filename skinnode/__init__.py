@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skinnode.model.status import Status
     from skinnode.model.tolerances import Tolerances
     from skinnode.record import Recorder, replay
+    from skinnode.remote import RemoteHand, connect, publish
     from skinnode.solve.operators.result import PointKind
     from skinnode.solve.operators.system import solve_system
     from skinnode.solve.options import PosteriorOptions, TrackerOptions
@@ -55,6 +56,9 @@ _HOME = {
     "Uniform": "skinnode.solve.paths.step_control",
     "Recorder": "skinnode.record",
     "replay": "skinnode.record",
+    "RemoteHand": "skinnode.remote",
+    "connect": "skinnode.remote",
+    "publish": "skinnode.remote",
     "PathResult": "skinnode.solve.paths.path",
     "solve_path": "skinnode.solve.paths.path",
     "Posterior": "skinnode.solve.posterior.posterior",
@@ -83,6 +87,7 @@ __all__ = [
     "Posterior",
     "PosteriorOptions",
     "Recorder",
+    "RemoteHand",
     "ResistanceFrame",
     "Rubber",
     "ScanStamp",
@@ -94,7 +99,9 @@ __all__ = [
     "Uniform",
     "Wrench",
     "__version__",
+    "connect",
     "jacobian",
+    "publish",
     "replay",
     "resistance_ohm",
     "solve_path",

@@ -61,6 +61,21 @@ def final_state_text(plan: HandConfig) -> str:
     return "; ".join(f"nodes on {bus.name} are {ends[bus.role]}" for bus in used)
 
 
+def exit_status(running: Host, faults: Sequence[str]) -> int:
+    """Return the exit status of a run.
+
+    Args:
+        running: The host, after its end.
+        faults: Faults of the run.
+
+    Returns:
+        2 if a node sent frames whose content does not match their identifier, 1 for other faults, 0 for none.
+    """
+    if running.stats().malformed:
+        return 2
+    return 1 if faults else 0
+
+
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the run's faults and notes, one line each.
 

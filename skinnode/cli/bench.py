@@ -473,6 +473,33 @@ def recording(
 
 
 @app.command()
+def remote(
+    json: JsonFile = None,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration, s.")] = 60.0,
+    publish_only: Annotated[
+        bool, typer.Option("--publish-only", help="Run no second process and no ping; measure the host.")
+    ] = False,
+) -> None:
+    """Run a host with sixteen patches and a program in a second process; measure losses and latency.
+
+    At the same time, two more processes exchange pings of the size of a field over Zenoh. The exit status is
+    1 if a field was lost. The measured times do not affect the exit status.
+    """
+    from skinnode.bench import remote as bench
+    from skinnode.remote.session import require_zenoh
+
+    require_zenoh("skinnode bench remote")
+    _prepare(json)
+    figures = bench.run(seconds, publish_only=publish_only, report=lambda row: None)
+    typer.echo(bench.line(figures["total"]))
+    _print_machine(figures)
+    _print_must(figures["must"])
+    _write(json, figures)
+    if not all(row["reached"] for row in figures["must"] if not row["time"]):
+        raise typer.Exit(1)
+
+
+@app.command()
 def soak(
     json: JsonFile = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak test in minutes.")] = 10.0,

@@ -10,6 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
+from skinnode.cli._publish import (
+    AskedPublication,
+    Commands,
+    Connections,
+    Listen,
+    Port,
+    Publish,
+    Router,
+    ZenohConfig,
+    asked_publication,
+)
 
 if TYPE_CHECKING:
     from skinnode.cli._run_report import Report
@@ -27,12 +38,19 @@ def host(
     channel: OtherChannel = None,
     seconds: Seconds = None,
     as_json: JsonLines = False,
+    publish: Publish = False,
+    commands: Commands = False,
+    listen: Listen = None,
+    router: Router = None,
+    zenoh_config: ZenohConfig = None,
+    port: Port = None,
 ) -> None:
     """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
 
     Onsets and releases of touches are reported when they happen. With --json, each patch has `touched`,
     `touch_odds` and `contacts` (null before the first field): centroid, area, normal and shear force with
-    standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
+    standard deviations, in m, m² and N. With --publish, other processes can use the hand
+    (sk.connect in Python, or ROS 2 by rmw_zenoh). Ctrl-C ends the command and leaves the nodes
     pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
     reported errors, or a guest received no SYNC. The exit status is also 1 if a scan was torn or a frame was
     lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
@@ -41,6 +59,8 @@ def host(
     from skinnode.config import load_hand
 
     plan = load_hand(hand).on(interface, channel)  # before the imports that take a second
+    connections = Connections(listen, router, zenoh_config, port)
+    published = asked_publication(connections, publish=publish, commands=commands)
     from skinnode.cli._run_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold
     from skinnode.host.scan_solver import check_solvable
@@ -51,18 +71,24 @@ def host(
         report.note("compiling the kernels once; this takes a few seconds")
     for patch in plan.patches:  # no resource is open yet, so Ctrl-C may end the program at once
         check_solvable(patch, plan.solver)
-    with stop_on_signal() as stop:
-        status = _run(plan, seconds, report, stop)
+    with stop_on_signal() as stop, published.claimed(plan):  # refused before the bring-up
+        status = _run(plan, seconds, report, stop, published)
     if status:
         raise typer.Exit(status)
 
 
-def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threading.Event) -> int:
+def _run(
+    plan: HandConfig,
+    seconds: float | None,
+    report: Report,
+    stop: threading.Event,
+    published: AskedPublication,
+) -> int:
     """Run the hand until the host is stopped or the duration has elapsed, and return the exit status.
 
     The host logs each frame whose content does not match its identifier; Python prints the log on stderr.
     """
-    from skinnode.cli._run_report import faults_and_notes, final_state_text, operational_text
+    from skinnode.cli._run_report import exit_status, faults_and_notes, final_state_text, operational_text
     from skinnode.host import BringUpCancelled, Host
     from skinnode.process.garbage_collection import without_long_collections
 
@@ -70,7 +96,8 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
         with without_long_collections(), Host.from_config(plan, cancelled=stop.is_set) as running:
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{operational_text(running)} on {where}; press Ctrl-C to stop")
-            _watch(running, stop, seconds, report)
+            with published.running(running, report):
+                _watch(running, stop, seconds, report)
             faults, notes = faults_and_notes(running)
     except BringUpCancelled:
         return 0
@@ -79,9 +106,7 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
         report.note(f"note: {note}")
     for fault in faults:
         report.note(f"fault: {fault}")
-    if running.stats().malformed:
-        return 2
-    return 1 if faults else 0
+    return exit_status(running, faults)
 
 
 def _note_touches(events: EventSubscription, report: Report) -> None:

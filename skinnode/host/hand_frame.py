@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
+from skinnode.config import HandConfig
 from skinnode.host.health import SCANS_MISSED, Condition
 from skinnode.host.publish import Subscription, check_timeout
 from skinnode.host.skeleton import Skeleton
@@ -317,6 +318,20 @@ class HandSubscription(Closing):
 
     def _too_long(self) -> TimeoutError:
         return TimeoutError(f"no hand frame within {self._timeout_s} s")
+
+
+def require_one_sync(hand: HandConfig) -> None:
+    """Check that one SYNC with a counter numbers the scans of all patches.
+
+    Raises:
+        ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.
+    """
+    others = {patch.bus for patch in hand.patches if hand.bus(patch.bus).role == "guest"}
+    ours = any(patch.bus not in others for patch in hand.patches)
+    producers = len(others) + ours
+    if producers > 1 or hand.sync.counter_overflow == 0:
+        got = "none with a counter" if producers == 1 else f"{producers}"
+        raise ValueError(f"SYNC producers: got {got}, must be a single producer with a counter")
 
 
 def _end_ns(timeout_s: float | None) -> int | None:

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skinnode.config import BusConfig, HandConfig, load_hand
-from skinnode.errors import CodecError
+from skinnode.errors import CodecError, NodeError
+from skinnode.host import nmt_master
 from skinnode.host.callback import FieldCallback
 from skinnode.host.configurator import BOOT_DEADLINE_S
 from skinnode.host.containment import DefectStats
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, EventSubscription
-from skinnode.host.hand_frame import HandGatherer, HandSubscription
+from skinnode.host.hand_frame import HandGatherer, HandSubscription, require_one_sync
 from skinnode.host.health import BusHealth, PatchHealth, faults_of
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.lifecycle import HostParts, StartOptions, never, running_parts
@@ -29,6 +30,7 @@ from skinnode.host.sync import SyncStats
 from skinnode.host.tap import ContainedTap, HostTap, tap_bus
 from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS, tare
 from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
 from skinnode.transport import CanPort
 
@@ -211,7 +213,7 @@ class Host:
         Raises:
             ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.
         """
-        self._require_one_sync()
+        require_one_sync(self.hand)
         patches = [patch.name for patch in self.hand.patches]
         kept = (self.hand.stream.capacity_fields if capacity is None else capacity) * len(patches)
         patience_ns = 2 * self.hand.sync.period_ms * 1_000_000
@@ -250,6 +252,15 @@ class Host:
             ValueError: if there is no such patch.
         """
         return self._publisher.latest(patch)
+
+    def layout(self, patch: str) -> PatchLayout:
+        """Return the electrode layout with which a patch's fields are computed.
+
+        Raises:
+            KeyError: if there is no such patch.
+        """
+        facts = self._nodes[patch].facts
+        return self.hand.patch(patch).layout.build() if facts is None else facts.layout
 
     def health(self, patch: str) -> PatchHealth:
         """Return the health of a patch.
@@ -294,14 +305,6 @@ class Host:
             ValueError: if ``capacity`` is below 1.
         """
         return self._events.subscribe(capacity)
-
-    def _require_one_sync(self) -> None:
-        others = {patch.bus for patch in self.hand.patches if self.hand.bus(patch.bus).role == "guest"}
-        ours = any(patch.bus not in others for patch in self.hand.patches)
-        producers = len(others) + ours
-        if producers > 1 or self.hand.sync.counter_overflow == 0:
-            got = "none with a counter" if producers == 1 else f"{producers}"
-            raise ValueError(f"SYNC producers: got {got}, must be a single producer with a counter")
 
     def _all_health(self) -> dict[str, PatchHealth]:
         return {patch: self.health(patch) for patch in self._nodes}
@@ -358,6 +361,24 @@ class Host:
             lambda: self.health(patch),
             deadline_s,
         )
+
+    def reset_node(self, patch: str) -> None:
+        """Reset a patch's node (NMT *reset node*). The host brings the node up again when it has booted.
+
+        Args:
+            patch: Name of the patch.
+
+        Raises:
+            KeyError: if there is no such patch.
+            NodeError: if another master runs the bus.
+            BusError: if the command cannot be sent.
+        """
+        node = self._nodes[patch]
+        if node.has_other_master:
+            raise NodeError(
+                node.patch.node_id, f"another master runs {node.patch.bus}; it must reset the node"
+            )
+        nmt_master.reset(node.link.send, node.patch.node_id)
 
     def stats(self) -> HostStats:
         """Return all counters of the host."""

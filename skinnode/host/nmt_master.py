@@ -19,3 +19,8 @@ def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
     A pre-operational node sends heartbeats, EMCY messages and SDO responses, but no PDOs.
     """
     send(NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))
+
+
+def reset(send: Callable[[int, bytes], None], node_id: int) -> None:
+    """Command a node to set all objects to their power-on values and to boot."""
+    send(NMT_COB_ID, encode(NmtCommand.RESET_NODE, node_id))

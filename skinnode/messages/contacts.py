@@ -30,7 +30,7 @@ def contacts_message(field: FieldFrame, t_ns: int) -> Any:
         patch=stamp.patch,
         scan=stamp.scan,
         trusted=field.trusted,
-        contacts=[_contact(contact, on_patch(contact, field)) for contact in field.contacts],
+        contacts=[contact_message(contact, field) for contact in field.contacts],
     )
 
 
@@ -62,7 +62,9 @@ def on_patch(contact: Contact, field: FieldFrame) -> HandContact:
     return HandContact.on_link(contact, field.stamp.patch, Mount(), trusted=field.trusted)
 
 
-def _contact(contact: Contact, placed: HandContact) -> Any:
+def contact_message(contact: Contact, field: FieldFrame) -> Any:
+    """Return one of a field's contacts as ``skinnode_msgs/Contact``."""
+    placed = on_patch(contact, field)
     return message_type(CONTACT)(
         position=message_type("geometry_msgs/msg/Point")(*contact.centroid_m.tolist()),
         position_std=_vector(contact.centroid_std_m),

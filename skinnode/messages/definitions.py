@@ -20,6 +20,8 @@ DATA_FAULT: Final = "skinnode_msgs/msg/DataFault"
 CONTACT: Final = "skinnode_msgs/msg/Contact"
 CONTACTS: Final = "skinnode_msgs/msg/Contacts"
 JOURNAL_LINE: Final = "skinnode_msgs/msg/JournalLine"
+FIELD: Final = "skinnode_msgs/msg/Field"
+HEALTH_REPORT: Final = "skinnode_msgs/msg/HealthReport"
 
 DEFINITIONS: Final = {
     CAN_FRAME: """\
@@ -104,6 +106,31 @@ string patch
 int64 scan
 bool trusted
 skinnode_msgs/Contact[] contacts
+""",
+    FIELD: """\
+# Displacement field of a patch in double precision, complete. Published only over a network.
+uint16 VERSION=1
+skinnode_msgs/FieldInfo info
+int64 started_ns         # time since 1970 at which the publisher started, ns; identifies its run
+uint64 sequence          # number of the field of this patch in this run, from 1; a gap is a lost field
+int64 sent_ns            # time since 1970 at which the publisher sent the field, ns
+int64 wall_minus_mono_ns # time since 1970 minus the monotonic clock of the host, ns
+uint32 upper_wires
+uint32 electrodes        # per upper wire
+float64[] displacement   # (upper wire, electrode, axis), m, as all arrays below
+float64[] displacement_std
+float64[] core_std       # standard deviation without enlargement; empty if equal to displacement_std
+float64[] force          # N; empty if not computed
+float64[] data_share     # empty if all fractions are 1
+skinnode_msgs/Contact[] contacts
+float64[] contact_axes   # (contact, axis, coordinate): axes along and across the upper wires, and normal
+""",
+    HEALTH_REPORT: """\
+# Health of all patches and buses, and the counters of the publisher. Published only over a network.
+uint16 VERSION=1
+std_msgs/Header header
+int64 started_ns         # time since 1970 at which the publisher started, ns; identifies its run
+string json              # patches, buses, published (fields by patch) and dropped (fields)
 """,
     JOURNAL_LINE: """\
 # Line of the journal of a recording, as JSON. The first line contains the hand.

@@ -82,6 +82,12 @@ def log_message(event: HealthEvent, t_ns: int) -> Any:
     return message_type(LOG)(time_of(t_ns), level, event.subject, event.text, "skinnode", event.what, 0)
 
 
+def event_of(message: Any) -> tuple[HealthEvent, int]:
+    """Return the event from a ``rcl_interfaces/Log`` with ``t_ns`` 0, and its time since 1970, ns."""
+    t_ns = message.stamp.sec * 1_000_000_000 + message.stamp.nanosec
+    return HealthEvent(0, message.name, message.function, message.msg), t_ns
+
+
 def _joined(condition: str, reason: str) -> str:
     return f"{condition}: {reason}" if reason else condition
 

@@ -24,6 +24,7 @@ class PatchTopics(NamedTuple):
     field_info: str
     contacts: str
     contact_wrenches: str
+    full_field: str
 
 
 class BusTopics(NamedTuple):
@@ -41,13 +42,21 @@ class HandTopics:
 
     patches: dict[str, PatchTopics]
     buses: dict[str, BusTopics]
+    base: str
+    """Namespace of the hand."""
     events: str
+    health: str
     journal: str
+
+    @staticmethod
+    def base_of(hand: str) -> str:
+        """Return the namespace of the hand called ``hand``."""
+        return f"/{_tokens([hand])[hand]}"
 
     @classmethod
     def of(cls, hand: HandConfig) -> HandTopics:
         """Return the topics of a hand."""
-        base = f"/{_tokens([hand.name])[hand.name]}"
+        base = cls.base_of(hand.name)
         patches = _tokens([patch.name for patch in hand.patches])
         buses = _tokens([bus.name for bus in hand.buses])
         return cls(
@@ -64,7 +73,9 @@ class HandTopics:
                 )
                 for name, token in buses.items()
             },
+            base,
             f"{base}/events",
+            f"{base}/health",
             f"{base}/journal",
         )
 

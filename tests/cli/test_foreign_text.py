@@ -191,6 +191,7 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
             "node",
             "pipeline",
             "recording",
+            "remote",
             "scale",
             "soak",
             "stability",

@@ -136,6 +136,7 @@ NOBODY_THERE = [
     "convert nowhere.npz x.parquet --hand one.toml",
     "convert nowhere.log x.npz --hand wrong.toml",
     "bench recording --buses 0",
+    "bench remote --seconds 0",
     "monitor",
     "monitor --json",
     "monitor one.toml --json --replay x.log",

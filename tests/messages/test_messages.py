@@ -46,7 +46,7 @@ def test_a_time_that_the_message_cannot_hold_is_the_nearest() -> None:
 
 def test_messages_of_ours_have_a_version_in_their_schema() -> None:
     ours = [name for name in DEFINITIONS if name.startswith(OURS)]
-    assert len(ours) == 5
+    assert len(ours) == 7
     for name in ours:
         assert version_of(schema_text(name)) == version_of(DEFINITIONS[name]) == 1
 
@@ -58,7 +58,7 @@ def test_topics_are_valid_names_and_differ() -> None:
     topics = HandTopics.of(parse_hand({"name": "left hand", "buses": [bus], "patches": patches}))
     found = [topics.events, topics.journal, *topics.buses["can-0"]]
     found += [topic for each in topics.patches.values() for topic in each]
-    assert len(found) == len(set(found)) == 2 + 4 + 4 * len(names)
+    assert len(found) == len(set(found)) == 2 + 4 + 5 * len(names)
     for topic in found:
         assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic), topic
         assert "__" not in topic

@@ -1,0 +1,112 @@
+"""Options of ``skinnode host`` that publish the hand over Zenoh, and the publication itself."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+if TYPE_CHECKING:
+    from skinnode.cli._run_report import Report
+    from skinnode.config import HandConfig
+    from skinnode.host import Host
+    from skinnode.remote import SessionOptions
+    from skinnode.remote.claim import Claim
+
+Publish = Annotated[
+    bool, typer.Option("--publish", help="Publish fields, health and events over Zenoh, on this machine.")
+]
+Commands = Annotated[
+    bool, typer.Option("--commands", help="With --publish: programs may tare patches and reset nodes.")
+]
+Listen = Annotated[
+    str | None,
+    typer.Option(help="With --publish: another endpoint, such as tls/0.0.0.0:7447.", metavar="ENDPOINT"),
+]
+Router = Annotated[
+    str | None,
+    typer.Option(help="With --publish: Zenoh router, such as tcp/192.168.1.5:7447.", metavar="ENDPOINT"),
+]
+ZenohConfig = Annotated[
+    Path | None,
+    typer.Option(help="With --publish: Zenoh configuration with TLS and access control.", metavar="FILE"),
+]
+Port = Annotated[
+    int | None, typer.Option(help="With --publish: first of 16 ports on this machine; default 17447.")
+]
+
+
+class Connections(NamedTuple):
+    """Values of the options for connections; None if not given."""
+
+    listen: str | None
+    router: str | None
+    zenoh_config: Path | None
+    port: int | None
+
+
+class AskedPublication:
+    """Publication of a hand, or none.
+
+    Args:
+        options: Connections; None for no publication.
+        commands: Whether programs may command the hand.
+    """
+
+    def __init__(self, options: SessionOptions | None, *, commands: bool) -> None:
+        self._options, self._commands = options, commands
+        self._claim: Claim | None = None
+
+    @contextlib.contextmanager
+    def claimed(self, plan: HandConfig) -> Iterator[None]:
+        """Claim the hand; raises ConfigError if another daemon publishes it."""
+        if self._options is None:
+            yield
+            return
+        from skinnode.remote.claim import Claim
+
+        with Claim(plan, self._options) as self._claim:
+            yield
+
+    @contextlib.contextmanager
+    def running(self, host: Host, report: Report) -> Iterator[None]:
+        """Publish a running host, and report the counters at the end."""
+        if self._claim is None:
+            yield
+            return
+        from skinnode.remote import Publication
+        from skinnode.text.words import counted
+
+        with Publication(host, self._claim, commands=self._commands) as publication:
+            report.note(f"published as {host.hand.name!r}{', with commands' if self._commands else ''}")
+            yield
+        stats = publication.stats()
+        report.note(f"published {counted(sum(stats.published.values()), 'field')}; dropped {stats.dropped}")
+
+
+def asked_publication(connections: Connections, *, publish: bool, commands: bool) -> AskedPublication:
+    """Return the publication that the options ask for.
+
+    Raises:
+        ConfigError: if an option is invalid or lacks ``--publish``, or a package is missing.
+    """
+    from skinnode.errors import ConfigError, Shown
+
+    if not publish:
+        asked = {**connections._asdict(), "commands": commands or None}
+        for name, value in asked.items():
+            if value is not None:
+                option = f"--{name.replace('_', '-')}"
+                got = Shown("it") if value is True else value if isinstance(value, int) else str(value)
+                raise ConfigError(option, got, "only with --publish")
+        return AskedPublication(None, commands=False)
+    from skinnode.remote.session import PORT, SessionOptions, require_protected, require_zenoh
+
+    require_zenoh("--publish")
+    listen, router, config, port = connections
+    options = SessionOptions(router, listen, config, PORT if port is None else port)
+    require_protected(options, commands=commands)
+    return AskedPublication(options, commands=commands)

@@ -1,0 +1,67 @@
+"""Claims a hand for this process, so that each hand has only one daemon."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
+from skinnode.messages.topics import HandTopics
+from skinnode.remote import discovery, keys
+from skinnode.remote.session import SessionOptions, open_daemon, require_zenoh
+
+if TYPE_CHECKING:
+    import zenoh
+
+
+class Claim:
+    """Zenoh session of the only daemon of a hand, until :meth:`close`.
+
+    Two daemons that start at the same moment may both be refused. Daemons that cannot reach each other, such
+    as those on two machines whose router does not run, are not refused.
+
+    Args:
+        hand: The hand.
+        options: Connections of the daemon.
+
+    Raises:
+        ConfigError: if another daemon publishes the hand or a hand with the same topics, a package is
+            missing, or the connections cannot be opened.
+    """
+
+    def __init__(self, hand: HandConfig, options: SessionOptions | None = None) -> None:
+        require_zenoh("--publish")
+        self.hand = hand
+        self.session: zenoh.Session = open_daemon(options or SessionOptions())
+        try:
+            zid = str(self.session.zid())
+            self._token = self.session.liveliness().declare_token(keys.hand_token(hand.name, zid))
+            self._refuse_others(zid)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the session."""
+        self.session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _refuse_others(self, zid: str) -> None:
+        base = HandTopics.of(self.hand).base
+        for token in discovery.tokens(self.session):
+            other = keys.hand_of(token)
+            if keys.zid_of(token) == zid or HandTopics.base_of(other) != base:
+                continue
+            if other == self.hand.name:
+                allowed = "a hand that no other daemon publishes (end the other, or set another name)"
+            else:
+                allowed = f"a name that differs from {other!r}, which is published, in letters or digits"
+            raise ConfigError("name", self.hand.name, allowed, where=self.hand.where("name"))

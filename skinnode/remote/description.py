@@ -1,0 +1,122 @@
+"""Describes a published hand to programs: its configuration, layouts and the versions of its messages.
+
+The daemon sends the description as JSON in reply to a query.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from skinnode.config import HandConfig
+from skinnode.errors import ConfigError, SkinError
+from skinnode.messages.definitions import DEFINITIONS, FIELD, HEALTH_REPORT, version_of
+from skinnode.model.layout import PatchLayout
+from skinnode.record.journal import Header, parse_journal
+from skinnode.remote import keys
+
+if TYPE_CHECKING:
+    import zenoh
+
+_ANSWER_S: Final = 1.0
+_VERSIONS: Final = {name: version_of(DEFINITIONS[name]) or 0 for name in (FIELD, HEALTH_REPORT)}
+"""Versions of the messages that this package sends and reads."""
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """Facts about a published hand that do not change while it runs."""
+
+    hand: HandConfig
+    """Configuration of the hand, without the names of files; a program sees ``guest_sends`` as ``sdo``."""
+    layouts: Mapping[str, PatchLayout]
+    """Electrode layout of each patch, by patch name."""
+    boot_id: str
+    """ID of the run of the daemon's operating system: processes with the same ID share a monotonic clock."""
+    commands: bool
+    """Whether the daemon accepts commands."""
+
+    def encode(self) -> bytes:
+        """Return the description as JSON."""
+        layouts = {
+            name: {
+                "upper_m": layout.upper_m.tolist(),
+                "lower_m": layout.lower_m.tolist(),
+                "resistivity_ohm_per_m": layout.resistivity_ohm_per_m,
+                "name": layout.name,
+            }
+            for name, layout in self.layouts.items()
+        }
+        table = {
+            "versions": _VERSIONS,
+            "header": Header(_portable(self.hand), "", 0).line(),
+            "layouts": layouts,
+            "boot_id": self.boot_id,
+            "commands": self.commands,
+        }
+        return json.dumps(table).encode()
+
+    @classmethod
+    def decode(cls, data: bytes, hand: str) -> Description:
+        """Return the description from JSON.
+
+        Args:
+            data: The JSON.
+            hand: Name of the hand, for error messages.
+
+        Raises:
+            SkinError: if the daemon has another version of skinnode, whose messages differ.
+        """
+        try:
+            table = json.loads(data)
+            versions = {name: int(table["versions"][name]) for name in _VERSIONS}
+            for name, ours in _VERSIONS.items():
+                if versions[name] != ours:
+                    what = f"sends version {versions[name]} of {name}, but this program reads version {ours}"
+                    raise SkinError(f"hand {hand!r}: its daemon {what}; install the same skinnode on both")
+            header, _, _ = parse_journal(f"hand {hand!r}", "description", [table["header"].encode()])
+            layouts = {name: _layout(each) for name, each in table["layouts"].items()}
+            return cls(header.hand, layouts, str(table["boot_id"]), bool(table["commands"]))
+        except ConfigError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            why = f"its daemon sent no description ({error!r}); install the same skinnode on both"
+            raise SkinError(f"hand {hand!r}: {why}") from None
+
+
+def boot_id() -> str:
+    """Return the ID of the run of this machine's operating system; an empty string if it is unknown."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return ""
+
+
+def ask(session: zenoh.Session, hand: str) -> Description | None:
+    """Ask the daemon of a hand for its description; return None if there is no answer within a second.
+
+    Raises:
+        SkinError: see :meth:`Description.decode`.
+    """
+    for reply in session.get(keys.description_key(hand), timeout=_ANSWER_S):
+        if reply.ok is not None:
+            return Description.decode(reply.ok.payload.to_bytes(), hand)
+    return None
+
+
+def _portable(hand: HandConfig) -> HandConfig:
+    """Return the hand without a setting that requires a baseline file, which programs do not have."""
+    buses = tuple(
+        bus.model_copy(update={"guest_sends": "sdo"}) if bus.role == "guest" else bus for bus in hand.buses
+    )
+    return hand.model_copy(update={"buses": buses})
+
+
+def _layout(table: Mapping[str, Any]) -> PatchLayout:
+    upper_m, lower_m = (np.array(table[key], dtype=np.float64) for key in ("upper_m", "lower_m"))
+    return PatchLayout(upper_m, lower_m, table["resistivity_ohm_per_m"], table["name"])

@@ -1,0 +1,148 @@
+"""Decodes the messages of a daemon in a separate thread, and passes them on."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from skinnode.host.containment import Defects, keep_on
+from skinnode.host.drop_oldest_queue import DropOldestQueue, End
+from skinnode.host.events import HealthEvent
+from skinnode.messages.definitions import FIELD, HEALTH_REPORT
+from skinnode.messages.full_field import SendStamp, decode_field
+from skinnode.messages.health import LOG, event_of
+from skinnode.messages.health_report import HealthReport, decode_report
+from skinnode.messages.topics import HandTopics
+from skinnode.messages.typestore import decode
+from skinnode.model.frames import FieldFrame, sealed
+from skinnode.process import clock
+from skinnode.remote import keys
+from skinnode.remote.attachment import Attachment
+from skinnode.remote.description import Description, boot_id
+
+if TYPE_CHECKING:
+    import zenoh
+
+QUEUED: Final = 64
+"""Capacity of the queue between Zenoh and the thread, in messages per patch."""
+TURN_S: Final = 0.05
+"""Maximum time between two calls of ``on_turn``, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipients:
+    """Functions that receive the decoded data, called in the thread."""
+
+    field: Callable[[FieldFrame, SendStamp, int], None]
+    """Receives a field with times on this machine's monotonic clock, and the delay of the message, ns."""
+    report: Callable[[HealthReport], None]
+    event: Callable[[HealthEvent], None]
+    on_turn: Callable[[], None]
+    """Called between two messages."""
+
+
+class _Item(NamedTuple):
+    message: str
+    data: bytes
+    attachment: bytes
+    t_ns: int
+    """Time since 1970 at which the message arrived, ns."""
+
+
+class Receiver:
+    """Thread that receives from construction until :meth:`close`.
+
+    Args:
+        session: Session of the program.
+        description: Description of the hand.
+        recipients: Functions that receive the data.
+        defects: Record of malformed messages and other exceptions.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, description: Description, recipients: Recipients, defects: Defects
+    ) -> None:
+        hand = description.hand
+        self._recipients, self._defects = recipients, defects
+        self._same_clock = description.boot_id == boot_id() != ""
+        self._inbox: DropOldestQueue[_Item] = DropOldestQueue(QUEUED * len(hand.patches))
+        self._events_of: tuple[bytes, int] | None = None
+        self.dropped = 0
+        """Number of messages dropped because this process was too slow."""
+        self.events_lost = 0
+        """Number of events that the daemon has sent but that have not arrived."""
+        self._thread = clock.thread(target=self._run, name="receive")
+        self._thread.start()
+        topics = HandTopics.of(hand)
+        wanted = [(topic.full_field, FIELD) for topic in topics.patches.values()]
+        wanted += [(topics.health, HEALTH_REPORT), (topics.events, LOG)]
+        self._subscribers = [
+            session.declare_subscriber(keys.topic_key(topic, message), self._handler(message))
+            for topic, message in wanted
+        ]
+
+    def close(self) -> None:
+        """Stop receiving, and wait for the thread."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._inbox.put(End())
+        self._thread.join()
+
+    def _handler(self, message: str) -> Callable[[zenoh.Sample], None]:
+        """Return the function that queues a message; threads of Zenoh call it."""
+
+        def queue_it(sample: zenoh.Sample) -> None:
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            item = _Item(message, sample.payload.to_bytes(), attachment, clock.time_ns())
+            self.dropped += self._inbox.put(item)
+
+        return queue_it
+
+    # --- the thread
+
+    def _run(self) -> None:
+        keep_on(self._turn, self._defects, "receiving")
+
+    def _turn(self) -> bool:
+        self._recipients.on_turn()
+        try:
+            item = self._inbox.get(TURN_S)
+        except queue.Empty:
+            return True
+        if isinstance(item, End):
+            return False
+        if item.message == FIELD:
+            self._field(item)
+        elif item.message == LOG:
+            self._event(item)
+        else:
+            self._recipients.report(decode_report(item.data))
+        return True
+
+    def _field(self, item: _Item) -> None:
+        field, sent = decode_field(item.data)
+        stamp, offset_ns = field.stamp, self._offset_ns(sent.wall_minus_mono_ns)
+        assert stamp is not None
+        local = replace(
+            stamp,
+            t_sync_ns=stamp.t_sync_ns and stamp.t_sync_ns + offset_ns,
+            t_receive_ns=stamp.t_receive_ns + offset_ns,
+            t_solved_ns=stamp.t_solved_ns and stamp.t_solved_ns + offset_ns,
+        )
+        self._recipients.field(sealed(field, stamp=local), sent, item.t_ns - sent.sent_ns)
+
+    def _event(self, item: _Item) -> None:
+        event, t_ns = event_of(decode(item.data, LOG))
+        self._recipients.event(replace(event, t_ns=t_ns - (clock.time_ns() - clock.monotonic_ns())))
+        sequence, _, gid = Attachment.decode(item.attachment)
+        if self._events_of is not None and self._events_of[0] == gid:
+            self.events_lost += max(0, sequence - self._events_of[1] - 1)
+        self._events_of = gid, sequence
+
+    def _offset_ns(self, wall_minus_mono_ns: int) -> int:
+        """Return this machine's monotonic clock minus the host's, ns, from the wall clocks of both."""
+        if self._same_clock:
+            return 0
+        return wall_minus_mono_ns - (clock.time_ns() - clock.monotonic_ns())

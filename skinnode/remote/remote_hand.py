@@ -1,0 +1,297 @@
+"""Use a hand that another process runs: the same interface to fields, health and events as a host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+from skinnode.errors import SkinError
+from skinnode.host.callback import Callbacks, FieldCallback
+from skinnode.host.containment import Defects
+from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthEvent
+from skinnode.host.hand_frame import HandGatherer, HandSubscription, require_one_sync
+from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.publish import Publisher, Subscription
+from skinnode.host.skeleton import Skeleton
+from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS
+from skinnode.messages.full_field import SendStamp
+from skinnode.messages.health_report import HealthReport
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import PatchLayout
+from skinnode.process import clock
+from skinnode.remote import commands
+from skinnode.remote.accounts import PatchAccount, PatchCounts
+from skinnode.remote.daemon_watch import DaemonWatch
+from skinnode.remote.description import Description, ask
+from skinnode.remote.receiver import Receiver, Recipients
+
+if TYPE_CHECKING:
+    import zenoh
+
+SILENT_S: Final = 1.0
+"""Time without a report of the health, s, after which the daemon counts as silent; it sends four a second."""
+_RESET_S: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteStats:
+    """Counters of a program that is connected to a hand."""
+
+    patches: Mapping[str, PatchCounts]
+    dropped: int
+    """Number of messages dropped because this process was too slow; ``lost`` includes their fields."""
+    events_lost: int
+    """Number of events that the daemon has sent but that have not arrived."""
+    daemon_dropped: int
+    """Number of fields that the daemon has not sent because its process was too slow."""
+    malformed: int
+    """Number of messages that could not be decoded, and of other exceptions."""
+
+
+class RemoteHand:
+    """Hand that a daemon (``skinnode host --publish``) publishes; :func:`skinnode.connect` creates it.
+
+    If the daemon ends or the connection fails, subscriptions wait, :meth:`health` reports every patch as lost
+    with the reason, and :attr:`away` gives the reason. The connection is made again in the background.
+
+    Threads: any thread may call any method.
+
+    Args:
+        session: Session of the program, which :meth:`close` closes.
+        description: Description of the hand.
+    """
+
+    def __init__(self, session: zenoh.Session, description: Description) -> None:
+        self.hand = description.hand
+        self._session, self._description = session, description
+        names = tuple(patch.name for patch in self.hand.patches)
+        self._defects = Defects(f"hand {self.hand.name!r}")
+        self._publisher = Publisher(names, self._defects)
+        self._events, self._callbacks = Events(self._defects), Callbacks(self._defects)
+        self._accounts = {name: PatchAccount() for name in names}
+        self._report: HealthReport | None = None
+        self._t_report_ns = clock.monotonic_ns()
+        self._was_away: bool | None = None
+        self._watch = DaemonWatch(session, self.hand.name)
+        self._described = self._watch.arrivals
+        recipients = Recipients(self._on_field, self._on_report, self._events.publish, self._on_turn)
+        self._receiver = Receiver(session, description, recipients, self._defects)
+
+    # --- the interface of a host
+
+    def fields(
+        self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
+    ) -> Subscription:
+        """Subscribe to the fields of all scans from now on; see :meth:`skinnode.Host.fields`.
+
+        Raises:
+            ValueError: if there is no such patch, or ``capacity`` or ``timeout_s`` is out of range.
+        """
+        kept = self.hand.stream.capacity_fields if capacity is None else capacity
+        return self._publisher.subscribe(kept, timeout_s, patch)
+
+    def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
+        """Subscribe to hand frames; see :meth:`skinnode.Host.hands`.
+
+        Raises:
+            ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.
+        """
+        require_one_sync(self.hand)
+        patches = [patch.name for patch in self.hand.patches]
+        kept = (self.hand.stream.capacity_fields if capacity is None else capacity) * len(patches)
+        patience_ns = 2 * self.hand.sync.period_ms * 1_000_000
+        gatherer = HandGatherer(
+            patches, patience_ns, lambda patch: self.health(patch).condition, Skeleton.of(self.hand)
+        )
+        return HandSubscription(self.fields(capacity=kept), gatherer, timeout_s)
+
+    def on_field(
+        self,
+        function: Callable[[FieldFrame], object],
+        *,
+        patch: str | None = None,
+        capacity: int | None = None,
+    ) -> FieldCallback:
+        """Call ``function`` with each new field, on a separate thread; see :meth:`skinnode.Host.on_field`.
+
+        Raises:
+            TypeError: if ``function`` is not callable, or is async.
+            ValueError: if there is no such patch, or ``capacity`` is out of range.
+        """
+        return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
+
+    def latest(self, patch: str) -> FieldFrame | None:
+        """Return a patch's newest field without waiting; None before the first field.
+
+        ``stats().patches[patch].age_s`` is the age of the field.
+
+        Raises:
+            ValueError: if there is no such patch.
+        """
+        return self._publisher.latest(patch)
+
+    def layout(self, patch: str) -> PatchLayout:
+        """Return the electrode layout with which a patch's fields are computed.
+
+        Raises:
+            KeyError: if there is no such patch.
+        """
+        return self._description.layouts[patch]
+
+    def health(self, patch: str) -> PatchHealth:
+        """Return the health of a patch, from the newest report; ``lost`` while the daemon is away.
+
+        Raises:
+            KeyError: if there is no such patch.
+        """
+        report, away = self._report, self.away
+        assert report is not None  # connect waits for the first report
+        health = report.patches[patch]
+        since_s = (clock.monotonic_ns() - self._t_report_ns) * 1e-9
+        older = replace(
+            health,
+            heartbeat_age_s=None if health.heartbeat_age_s is None else health.heartbeat_age_s + since_s,
+            scan_age_s=None if health.scan_age_s is None else health.scan_age_s + since_s,
+        )
+        return older if away is None else replace(older, condition=Condition.LOST, complaint=away)
+
+    def bus_health(self, bus: str) -> BusHealth:
+        """Return the health of a bus, from the newest report; unavailable while the daemon is away.
+
+        Raises:
+            KeyError: if there is no such bus, or the bus has no patches.
+        """
+        report, away = self._report, self.away
+        assert report is not None
+        return report.buses[bus] if away is None else replace(report.buses[bus], away=away)
+
+    def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
+        """Subscribe to the events of the host, and to ``away`` and ``back`` of its daemon.
+
+        Args:
+            capacity: Queue length, in events. A full queue drops its oldest event.
+
+        Raises:
+            ValueError: if ``capacity`` is below 1.
+        """
+        return self._events.subscribe(capacity)
+
+    def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
+        """Tare a patch; see :meth:`skinnode.Host.tare`.
+
+        Raises:
+            KeyError: if there is no such patch.
+            NodeError: as the host raises it.
+            SkinError: if the daemon accepts no commands, or does not reply in time.
+        """
+        default_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
+        request: dict[str, object] = {"command": "tare", "patch": patch, "deadline_s": deadline_s}
+        self._command(request, default_s if deadline_s is None else deadline_s)
+
+    def reset_node(self, patch: str) -> None:
+        """Reset a patch's node; see :meth:`skinnode.Host.reset_node`.
+
+        Raises:
+            KeyError: if there is no such patch.
+            NodeError: as the host raises it.
+            SkinError: if the daemon accepts no commands, or does not reply in time.
+        """
+        self._command({"command": "reset_node", "patch": patch}, _RESET_S)
+
+    # --- the connection
+
+    @property
+    def away(self) -> str | None:
+        """Reason why no data arrive; None while the daemon is present and sends."""
+        now_ns = clock.monotonic_ns()
+        silent_s = (now_ns - self._t_report_ns) * 1e-9
+        if not self._watch.present:
+            since_s = (now_ns - self._watch.t_change_ns) * 1e-9
+            return f"no daemon has published hand {self.hand.name!r} for {since_s:.1f} s"
+        if silent_s > SILENT_S:
+            return f"the daemon of hand {self.hand.name!r} has sent nothing for {silent_s:.1f} s"
+        return None
+
+    @property
+    def ready(self) -> bool:
+        """Whether the first report of the health has arrived."""
+        return self._report is not None
+
+    def stats(self) -> RemoteStats:
+        """Return the counters."""
+        now_ns, report = clock.monotonic_ns(), self._report
+        return RemoteStats(
+            patches={name: account.counts(now_ns) for name, account in self._accounts.items()},
+            dropped=self._receiver.dropped,
+            events_lost=self._receiver.events_lost,
+            daemon_dropped=0 if report is None else report.dropped,
+            malformed=self._defects.count,
+        )
+
+    def close(self) -> None:
+        """End all subscriptions, the thread and the session."""
+        self._receiver.close()
+        self._session.close()
+        self._publisher.end()
+        self._events.end()
+        self._callbacks.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _command(self, request: dict[str, object], deadline_s: float) -> None:
+        patch = str(request["patch"])
+        if patch not in self._accounts:
+            raise KeyError(patch)
+        name = self.hand.name
+        if not self._description.commands:
+            what = "its daemon accepts no commands; start it with skinnode host --publish --commands"
+            raise SkinError(f"hand {name!r}: {what}")
+        if (away := self.away) is not None:
+            raise SkinError(away)
+        commands.send(self._session, name, request, deadline_s)
+
+    # --- the receiver's thread
+
+    def _on_field(self, field: FieldFrame, sent: SendStamp, delay_ns: int) -> None:
+        stamp = field.stamp
+        assert stamp is not None
+        if self._accounts[stamp.patch].add(sent, delay_ns, stamp.t_receive_ns):
+            self._publisher.publish(field, stamp.patch)
+
+    def _on_report(self, report: HealthReport) -> None:
+        buses = {bus.name for bus in self.hand.buses if self.hand.patches_on(bus.name)}
+        if set(report.patches) != set(self._accounts) or set(report.buses) != buses:
+            raise ValueError("a report of the health of another hand")
+        self._report, self._t_report_ns = report, clock.monotonic_ns()
+        for name, published in report.published.items():
+            self._accounts[name].published = published
+
+    def _on_turn(self) -> None:
+        """Publish an event when the daemon goes or returns, and read the description of a new daemon."""
+        if self._watch.arrivals != self._described:
+            arrivals = self._watch.arrivals
+            description = ask(self._session, self.hand.name)
+            if description is not None:  # else the daemon is starting: ask again
+                self._described = arrivals
+                self._take(description)
+        away = self.away
+        if self._report is None or (away is not None) == bool(self._was_away):
+            return
+        self._was_away = away is not None
+        what, text = ("back", "its daemon is back") if away is None else ("away", away)
+        self._events.publish(HealthEvent(clock.monotonic_ns(), "host", what, text))
+
+    def _take(self, description: Description) -> None:
+        if description.hand.model_dump() != self.hand.model_dump():
+            text = "its daemon has restarted with another hand file; connect again"
+            self._publisher.fail(SkinError(f"hand {self.hand.name!r}: {text}"))
+            return
+        self._description = description

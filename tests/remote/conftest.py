@@ -1,0 +1,106 @@
+"""A daemon in a process of its own, and ports that no other test uses."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+from skinnode.remote.session import PORTS
+from tests.remote.ports import free_ports
+
+PATIENCE_S = 60.0
+"""Limit of every wait; a daemon on a busy machine takes several seconds to load."""
+
+
+class Process:
+    """A program of this folder, which ends with its standard input."""
+
+    def __init__(self, program: str, *arguments: str) -> None:
+        path = Path(__file__).with_name(program)
+        self._command = [sys.executable, "-W", "error", str(path), *arguments]
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def wait_until_up(self) -> Self:
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        if self.process.stdout.readline() != "up\n":
+            raise AssertionError(self.process.stderr.read())
+        return self
+
+    def restart(self) -> None:
+        """Kill the program as ``kill -9`` does, and start it again."""
+        self.kill()
+        self.start()
+
+    def tell(self, command: str) -> str:
+        """Send a line, and return the answer."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(command + "\n")
+        self.process.stdin.flush()
+        return self.process.stdout.readline().strip()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._close()
+
+    def end(self) -> tuple[int, str]:
+        """End the program in order; return its exit status and what it said on stderr."""
+        _, said = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, said
+
+    def _close(self) -> None:
+        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
+            if pipe is not None and not pipe.closed:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+
+
+@pytest.fixture
+def port() -> int:
+    """First of the ports of the daemons of a test."""
+    return free_ports(PORTS)
+
+
+@pytest.fixture
+def run() -> Iterator[Callable[..., Process]]:
+    """Start a program; all that still run are killed at the end."""
+    running: list[Process] = []
+
+    def run_one(program: str, *arguments: str) -> Process:
+        running.append(Process(program, *arguments))
+        return running[-1]
+
+    yield run_one
+    for each in running:
+        each.kill()
+
+
+@pytest.fixture
+def start(port: int, run: Callable[..., Process]) -> Callable[..., Process]:
+    """Start a daemon with a simulated hand; see ``daemon.py``."""
+    return lambda **options: run("daemon.py", json.dumps({"port": port, **options}))
+
+
+def eventually(happens: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
+    """Wait until ``happens()`` is true; return the time it took, s."""
+    begin_s = time.monotonic()
+    while not happens():
+        if time.monotonic() > begin_s + within_s:
+            raise AssertionError(f"not within {within_s} s")
+        time.sleep(0.005)
+    return time.monotonic() - begin_s

@@ -240,10 +240,10 @@ def roc(seed: int, presses: int) -> list[dict[str, Any]]:
     from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
     patch = _patch(seed, "staggered", 0.5, NOISE, "steady")
-    rng, test = patch.rng, patch.detector.test
+    rng, statistic, basis = patch.rng, patch.detector.test.statistic, patch.detector.basis
     chances = np.logspace(-8, 0, 33)[:-1]
     frames_per_hour = 3600.0 / PERIOD_S
-    limits = np.array([upper_quantile(test.weights, chance) for chance in chances])
+    limits = np.array([upper_quantile(statistic.weights, chance) for chance in chances])
     rows = []
     for kind, depth in (
         ("blunt sphere", 0.01),
@@ -256,7 +256,7 @@ def roc(seed: int, presses: int) -> list[dict[str, Any]]:
             ohm = patch.pressed_ohm(load_of(kind, depth, patch.layout, rng))
             y = np.log(patch.rest_ohm / ohm) / NOISE
             noise = rng.standard_normal((3, *y.shape))
-            z = test.rows @ (y + noise).reshape(3, -1).T
+            z = statistic.rows @ np.array([basis.features(y + each) for each in noise]).T
             ones.append(float((z[:, 0] ** 2).sum()))
             threes.append(float((z.sum(axis=1) ** 2).sum()) / 3.0)
             wires.append(float((((y + noise[0]) ** 2).sum(axis=1)).max()))

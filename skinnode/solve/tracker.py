@@ -81,6 +81,10 @@ class Tracker:
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
         self._rest = RestGate(layout, options) if options.detect else None
+        self._stated = broadcast_noise(options.relative_noise, layout)
+        self._stated_of_codes = (
+            self._stated if options.codes is None else broadcast_noise(options.codes.relative_noise, layout)
+        )
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
@@ -193,7 +197,7 @@ class Tracker:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
         if self._rest is not None:
             ohm, valid = meaning.decode(checked_codes(codes, self.layout))
-            rest = self._at_rest(ohm, valid, None, meaning)
+            rest = self._at_rest(ohm, None, None, meaning)  # invalid codes are NaN
             if rest is not None:
                 return rest, valid.size - int(np.count_nonzero(valid))
         if self._exact is None or self.method == "posterior":
@@ -239,9 +243,7 @@ class Tracker:
         check.pass_frame()
         stated = noise
         if stated is None:
-            stated = broadcast_noise(
-                self.options.relative_noise if codes is None else codes.relative_noise, self.layout
-            )
+            stated = self._stated if codes is None else self._stated_of_codes
         rounding_ohm = None if codes is None else codes.rounding_ohm
         if not exact:
             self._posterior.see_noise(ohm, stated, rounding_ohm, valid)

@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 import skinnode as sk
 from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.detect.gain_drift import GainFilter, Growth
+from skinnode.solve.detect.gain_kernel import gain_arrays, use_block
 from skinnode.solve.detect.touch_statistic import (
     DEPTH,
     PATCH_VARIANCES,
@@ -138,10 +139,11 @@ def test_false_alarms_in_a_hundred_patch_hours_agree_with_the_stated_rate() -> N
 def test_gains_that_drift_longer_are_known_less_well() -> None:
     gains = GainFilter.of(LAYOUT.shape, np.ones(LAYOUT.shape).tobytes())
     growth = Growth(10.0, 20.0, 10.0, 20.0)  # 1 % and 2 % of noise 1e-3
-    none = np.zeros_like(gains.by_wires)
 
     def variance(seconds: float) -> float:
-        return float(np.diag(gains.basis @ gains.grown(none, *growth.after(seconds)) @ gains.basis.T).mean())
+        wires, patch = growth.after(seconds)
+        covariance = wires * gains.by_wires + patch * gains.by_patch
+        return float(np.diag(gains.basis_t.T @ covariance @ gains.basis_t).mean())
 
     variances = [variance(seconds) for seconds in (0.0, 1.0, 60.0, 3600.0)]
     assert np.all(np.diff(variances) > 0)
@@ -161,12 +163,13 @@ def test_the_gain_filter_is_the_kalman_filter_of_all_gains(several: bool) -> Non
     kalman = np.diag(prior) @ effect.T @ np.linalg.inv(innovation)
     after = np.diag(prior) - kalman @ effect @ np.diag(prior)
 
-    gain, covariance = gains.updated(gains.start(prior), frames)
-    v = gain @ (gains.basis.T @ y)
-    np.testing.assert_allclose(gains.basis @ v, effect @ kalman @ y, atol=1e-12)
-    np.testing.assert_allclose(effect @ (gains.to_gains @ v), effect @ kalman @ y, atol=1e-12)
+    its = gain_arrays(gains)
+    its.mean[:], its.covariance[:] = y, gains.start(prior)
+    use_block(its.table, 0.0, 0.0, frames, 0.0)
+    np.testing.assert_allclose(its.expected, effect @ kalman @ y, atol=1e-12)
+    np.testing.assert_allclose(effect @ (gains.to_gains @ its.v), effect @ kalman @ y, atol=1e-12)
     np.testing.assert_allclose(
-        gains.basis @ covariance @ gains.basis.T, effect @ after @ effect.T, atol=1e-12
+        gains.basis_t.T @ its.covariance @ gains.basis_t, effect @ after @ effect.T, atol=1e-12
     )
     upper, lower = LAYOUT.shape
     contrasts = [
@@ -174,6 +177,4 @@ def test_the_gain_filter_is_the_kalman_filter_of_all_gains(several: bool) -> Non
         for block, count in ((after[:upper, :upper], upper), (after[upper:-1, upper:-1], lower))
     ]
     mean = np.concatenate([np.full(upper, 1 / upper), np.full(lower, 1 / lower), [1.0]])
-    np.testing.assert_allclose(
-        gains.variances(covariance), [max(contrasts), mean @ after @ mean], atol=1e-12
-    )
+    np.testing.assert_allclose(its.variances, [max(contrasts), mean @ after @ mean], atol=1e-12)

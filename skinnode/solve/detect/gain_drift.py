@@ -57,12 +57,15 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class GainFilter:
-    """Kalman filter for the gains of one kind of patch, in V = U + K − 1 visible coordinates v."""
+    """Constants of the Kalman filter for the gains of one kind of patch, in V = U + K − 1 visible coordinates v.
+
+    :mod:`skinnode.solve.detect.gain_kernel` contains the filter.
+    """
 
     effect: Float
     """(m, U + K + 1) effect of each gain (upper wires, lower wires, patch) on the m = U K readings."""
-    basis: Float
-    """(m, V) matrix Q with orthonormal columns."""
+    basis_t: Float
+    """(V, m) matrix Qᵀ with orthonormal rows."""
     to_gains: Float
     """(U + K + 1, V) gains for given v. A combination of gains that no reading shows is zero."""
     by_wires: Float
@@ -89,31 +92,8 @@ class GainFilter:
 
     def start(self, variances: Float) -> Float:
         """Return the covariance (V, V) of v for independent gains with the given ``variances``."""
-        seen = self.basis.T @ self.effect
+        seen = self.basis_t @ self.effect
         return np.asarray((seen * variances) @ seen.T)
-
-    def grown(self, covariance: Float, wires: float, patch: float) -> Float:
-        """Return ``covariance`` (V, V) after the variances of the gains have grown by ``wires`` and ``patch``."""
-        return np.asarray(covariance + wires * self.by_wires + patch * self.by_patch)
-
-    def updated(self, covariance: Float, frames: int) -> tuple[Float, Float]:
-        """Return the Kalman gain (V, V) for the mean of ``frames`` frames, and the covariance after the update.
-
-        The gain multiplies Qᵀ y, where y (m,) is the unexpected change of the block mean.
-
-        Args:
-            covariance: (V, V) covariance of v before the update.
-            frames: Number n of frames in the block.
-        """
-        one = np.eye(len(covariance))
-        gain = one - np.linalg.inv(one + frames * covariance)  # n P (I + n P)⁻¹
-        gain = 0.5 * (gain + gain.T)
-        return gain, gain / frames
-
-    def variances(self, covariance: Float) -> tuple[float, float]:
-        """Return the largest variance of a wire's gain about its layer's mean, and the variance of the mean."""
-        wires = max(float((self.of_uppers * covariance).sum()), float((self.of_lowers * covariance).sum()))
-        return wires, float(self.of_mean @ covariance @ self.of_mean)
 
 
 def effect_of(shape: tuple[int, int], ratios: Float) -> Float:
@@ -137,7 +117,7 @@ def _filter(shape: tuple[int, int], ratios: bytes) -> GainFilter:
     effect = effect_of(shape, np.frombuffer(ratios).reshape(shape))
     basis, singular, turn = np.linalg.svd(effect, full_matrices=False)
     seen = singular > _VISIBLE * singular[0]
-    basis, to_v = np.ascontiguousarray(basis[:, seen]), singular[seen, None] * turn[seen]
+    basis_t, to_v = np.ascontiguousarray(basis[:, seen].T), singular[seen, None] * turn[seen]
     to_gains = np.ascontiguousarray(turn[seen].T / singular[seen])
     wires = to_v[:, :-1]
     mean = np.concatenate([np.full(upper, 1.0 / upper), np.full(lower, 1.0 / lower), [1.0]])
@@ -145,15 +125,15 @@ def _filter(shape: tuple[int, int], ratios: bytes) -> GainFilter:
     def contrast(first: int, count: int) -> Float:
         rows = to_gains[first : first + count]
         rows = rows - rows.mean(axis=0)
-        return np.asarray(rows.T @ rows / max(count - 1, 1))
+        return np.ascontiguousarray(rows.T @ rows / max(count - 1, 1))
 
     return GainFilter(
         effect=effect,
-        basis=basis,
+        basis_t=basis_t,
         to_gains=to_gains,
-        by_wires=np.asarray(wires @ wires.T),
+        by_wires=np.ascontiguousarray(wires @ wires.T),
         by_patch=np.outer(to_v[:, -1], to_v[:, -1]),
         of_uppers=contrast(0, upper),
         of_lowers=contrast(upper, lower),
-        of_mean=to_gains.T @ mean,
+        of_mean=np.ascontiguousarray(to_gains.T @ mean),
     )

@@ -52,7 +52,9 @@ class HeldTouch:
     _like_rest: int = 0  # number of successive frames that drift could explain
     _lighter: bool = True  # False from a frame that drift cannot explain until a change towards rest
 
-    def follow(self, features: Float, at: int, oldest: Float, variance: float, later: TouchTest) -> bool | None:
+    def follow(
+        self, features: Float, at: int, oldest: Float, variance: float, later: TouchTest
+    ) -> bool | None:
         """Process a frame; return whether the touch ended, or None if it ended and creep remains.
 
         Args:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
 from skinnode.solve.detect.gain_drift import DRIFT, MEASURED_S, PATCH_DRIFT, GainFilter, Growth
+from skinnode.solve.detect.gain_kernel import MEAN, WIRES, find_variances, gain_arrays, use_block
 from skinnode.solve.detect.touch_statistic import PATCH_VARIANCES, WIRE_VARIANCES
 
 BLOCK_S: Final = 0.25
@@ -83,11 +84,12 @@ class SlowState:
 
     def __init__(self, stream: Stream, shape: tuple[int, int]) -> None:
         self._stream, self._filter, self._shape = stream, stream.filter, shape
-        self.expected = np.zeros(shape)
+        self._arrays = gain_arrays(stream.filter)
+        self.expected = self._arrays.expected.reshape(shape)
         self._block_s = stream.block * stream.period_s
         self._base = int(HELD_BACK * stream.block)
         self._blocks_apart = max(1, round(MEASURED_S / self._block_s))
-        self._sum, self._seen = np.zeros(shape), np.zeros(shape)
+        self._sum, self._seen, self._missing = np.zeros(shape), np.zeros(shape), False
         self._mean_share = 1.0 / shape[0] + 1.0 / shape[1]
         self._unit = stream.unit
         self._floor = stream.unit * math.sqrt(3600.0) / 64.0  # a smaller drift does not matter
@@ -96,9 +98,10 @@ class SlowState:
     def reset(self) -> None:
         """Forget the stream."""
         gains = sum(self._shape) + 1
-        self._v, self._offset = np.zeros(self._filter.basis.shape[1]), np.zeros(self._shape)
-        self.expected[:] = 0.0
-        self._filled, self._waiting = 0, False
+        its = self._arrays
+        its.v[:], its.offset[:], its.expected[:] = 0.0, 0.0, 0.0
+        self._clear_block()
+        self._waiting = False
         self._waiting_mean = np.zeros(self._shape)
         self._measured, self._weight = 0.0, 0.0  # drift: mean of the measurements, and their number
         self._patch_measured = 0.0
@@ -111,24 +114,26 @@ class SlowState:
         if self._stream.start is not None:
             variances = self._stream.start / self._unit**2
         self.offset_share = 0.0
-        self._set_covariance(self._filter.start(variances), 0)
+        its.covariance[:] = self._filter.start(variances)
+        find_variances(its.table)
+        self._set_age(0)
 
     def _set_drift(self, drift: float, patch_drift: float) -> None:
         self._drift, self._patch_drift = drift, patch_drift
         unit = self._unit
         self._growth = Growth(drift / unit, patch_drift / unit, DRIFT / unit, PATCH_DRIFT / unit)
 
-    def _set_covariance(self, covariance: Float, age: int) -> None:
-        """Set the covariance of v after the newest frame in the estimate, and the age of this frame."""
-        self._covariance, self.age = covariance, age
-        self._variances = self._filter.variances(covariance)
+    def _set_age(self, age: int) -> None:
+        """Set the age of the newest frame in the estimate."""
+        self.age = age
+        self._variances = self._arrays.variances.tolist()
         self.level = self._level_at(self._base)
 
     def _level_at(self, age: int) -> tuple[int, int]:
         """Return the level whose variances cover those of the gains when the newest frame is ``age`` frames old."""
         wires, patch = self._growth.after(age * self._stream.period_s)
-        wire_level = _least(WIRE_VARIANCES, self._variances[0] + wires)
-        mean = self._variances[1] + wires * self._mean_share + patch
+        wire_level = _least(WIRE_VARIANCES, self._variances[WIRES] + wires)
+        mean = self._variances[MEAN] + wires * self._mean_share + patch
         return wire_level, _least(PATCH_VARIANCES, mean - WIRE_VARIANCES[wire_level] * self._mean_share)
 
     @property
@@ -139,7 +144,7 @@ class SlowState:
     @property
     def gains(self) -> Float:
         """(U + K + 1,) relative changes in conductance of the upper wires, the lower wires and the patch."""
-        return np.asarray(self._filter.to_gains @ self._v) * self._unit
+        return np.asarray(self._filter.to_gains @ self._arrays.v) * self._unit
 
     def collect(self, y: Float, present: NDArray[np.bool_] | None, noise: float) -> bool:
         """Add an untouched frame; return whether :attr:`expected` or :attr:`level` changed.
@@ -151,17 +156,28 @@ class SlowState:
         """
         self._pass_frame()
         self._sum += y
-        self._sum += self.expected if present is None else np.where(present, self.expected, 0.0)
-        self._seen += 1.0 if present is None else present
+        if present is not None:
+            if not self._missing:
+                self._seen[:], self._missing = self._filled, True
+            self._seen += present
+        elif self._missing:
+            self._seen += 1.0
         self._filled += 1
         if self._filled < self._stream.block:
             return self._grow()
-        mean = np.divide(self._sum, self._seen, out=self.expected.copy(), where=self._seen > 0.0)
-        self._sum[:], self._seen[:], self._filled = 0.0, 0.0, 0
+        if self._missing:
+            beyond = np.divide(self._sum, self._seen, out=np.zeros(self._shape), where=self._seen > 0.0)
+        else:
+            beyond = self._sum / self._filled
+        mean = self.expected + beyond
+        self._clear_block()
         if self._waiting:
             self._use(self._waiting_mean, noise)
         self._waiting_mean, self._waiting = mean, True
         return True
+
+    def _clear_block(self) -> None:
+        self._sum[:], self._filled, self._missing = 0.0, 0, False
 
     def skip(self) -> bool:
         """Count a frame without using it; return whether :attr:`level` changed."""
@@ -182,7 +198,8 @@ class SlowState:
 
     def discard(self) -> None:
         """Discard the frames that have not been used yet, because a touch was detected."""
-        self._sum[:], self._seen[:], self._filled, self._waiting = 0.0, 0.0, 0, False
+        self._clear_block()
+        self._waiting = False
         self._means.clear()
 
     def released(self, residue: Float | None = None) -> None:
@@ -194,9 +211,9 @@ class SlowState:
         """
         self._released = 0
         if residue is not None:
-            self._offset += residue
-            self.expected += residue
-            self._set_covariance(self._covariance, 0)
+            self._arrays.offset += residue.ravel()
+            self._arrays.expected += residue.ravel()
+            self._set_age(0)
 
     def carry_on(self, gains: Float, expected: Float) -> None:
         """Continue with the gains and expected changes of the same stream at a different noise.
@@ -205,28 +222,22 @@ class SlowState:
             gains: (U + K + 1,) relative changes in conductance; see :attr:`gains`.
             expected: (U, K) expected changes, in units of the noise.
         """
-        self._v = self._filter.basis.T @ (self._filter.effect @ (gains / self._unit))
-        self._offset = expected - self._by_gains()
-        self.expected[:] = expected
-
-    def _by_gains(self) -> Float:
-        """Return the changes (U, K) of the readings that the gains cause."""
-        return np.asarray(self._filter.basis @ self._v).reshape(self._shape)
+        its = self._arrays
+        its.v[:] = self._filter.basis_t @ (self._filter.effect @ (gains / self._unit))
+        its.expected[:] = expected.ravel()
+        its.offset[:] = its.expected - its.v @ its.basis_t
 
     def _use(self, mean: Float, noise: float) -> None:
         """Estimate the gains and offsets from the mean of a block."""
-        block = self._stream.block
+        block, its = self._stream.block, self._arrays
         self._measure_drift(mean, noise)
-        beyond = mean - self.expected
-        since = self.age - 2 * block  # frames since the last block that was used
-        growth = self._growth.after((max(since, 0) + block) * self._stream.period_s)
-        gain, covariance = self._filter.updated(self._filter.grown(self._covariance, *growth), block)
-        self._v += gain @ (self._filter.basis.T @ beyond.ravel())
-        by_gains, share = self._by_gains(), self._offset_weight()
-        self._offset += share * (mean - by_gains - self._offset)
+        since = max(self.age - 2 * block, 0)  # frames since the last block that was used
+        wires, patch = self._growth.after((since + block) * self._stream.period_s)
+        share = self._offset_weight()
+        its.mean[:] = mean.ravel()
+        use_block(its.table, wires, patch, block, share)
         self.offset_share = 0.5 * share / block
-        np.add(by_gains, self._offset, out=self.expected)
-        self._set_covariance(covariance, block)
+        self._set_age(block)
 
     def _offset_weight(self) -> float:
         """Return the weight of a block in the offsets."""

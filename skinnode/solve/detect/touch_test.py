@@ -110,7 +110,7 @@ class TouchTests:
         return independent + self._coded * (same - independent)
 
 
-def touch_tests(  # noqa: PLR0913 - what determines a test
+def touch_tests(
     layout: PatchLayout,
     ratios: bytes,
     coded: float,

@@ -97,7 +97,8 @@ def _tail(weights: Float, value: float) -> float:
         cubes += weight * weight * weight
     if abs(t) * mean < 1e-4:  # near the mean, where the formula is 0/0
         skewness = 8.0 * cubes / (2.0 * squares) ** 1.5
-        return 0.5 - skewness / (6.0 * math.sqrt(2.0 * math.pi))
+        found: float = 0.5 - skewness / (6.0 * math.sqrt(2.0 * math.pi))
+        return found
     w = math.copysign(math.sqrt(max(2.0 * (t * value - cumulant), 0.0)), t)
     u = t * math.sqrt(curvature)
     density = math.exp(-0.5 * w * w) / math.sqrt(2.0 * math.pi)

@@ -33,7 +33,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     for row in figures["alarms"]:
         echo(
             f"  noise {row['noise']:.0e}, {row['drift']:6} drift: {row['alarms']:4} in {row['hours']:g} h,"
-            f" {row['per_hour']:.2g} an hour, set {row['set_per_hour']:g}"
+            f" {row['per_hour']:.2g} an hour, set {row['set_per_hour']:g} ({row['cpu_s']:.0f} s of CPU time)"
         )
     time = figures["time"]
     echo(

@@ -10,6 +10,7 @@ import skinnode as sk
 from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.detect.gain_drift import GainFilter, Growth
 from skinnode.solve.detect.gain_kernel import gain_arrays, use_block
+from skinnode.solve.detect.touch_odds import log_likelihood_ratio
 from skinnode.solve.detect.touch_statistic import (
     DEPTH,
     PATCH_VARIANCES,
@@ -17,7 +18,7 @@ from skinnode.solve.detect.touch_statistic import (
     WIRE_VARIANCES,
     TouchBasis,
 )
-from skinnode.solve.detect.touch_test import TouchTests, log_likelihood_ratio, touch_tests
+from skinnode.solve.detect.touch_test import TouchTests, touch_tests
 from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
 NOISE = 1e-3

@@ -57,8 +57,9 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class GainFilter:
-    """Constants of the Kalman filter for the gains of one kind of patch, in V = U + K − 1 visible coordinates v.
+    """Constants of the Kalman filter for the gains of one kind of patch.
 
+    The filter uses V = U + K − 1 visible coordinates v.
     :mod:`skinnode.solve.detect.gain_kernel` contains the filter.
     """
 

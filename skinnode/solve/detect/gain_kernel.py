@@ -123,6 +123,23 @@ def _find_variances(its: GainArrays) -> None:
     variances[MEAN] = total
 
 
+@njit_part
+def _update_covariance(its: GainArrays, wires: float, patch: float, frames: int) -> None:
+    """Let the covariance grow, and reduce it by a block; the arguments are those of :func:`use_block`."""
+    covariance, inverse, by_wires, by_patch = its.covariance, its.inverse, its.by_wires, its.by_patch
+    n = covariance.shape[0]
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = frames * (covariance[i, j] + wires * by_wires[i, j] + patch * by_patch[i, j])
+        inverse[i, i] += 1.0
+    _invert(inverse)
+    # the gain n P (I + n P)⁻¹ = I − (I + n P)⁻¹ is n times the covariance after the update
+    for i in range(n):
+        for j in range(n):
+            gain = -0.5 * (inverse[i, j] + inverse[j, i])
+            covariance[i, j] = (gain + (1.0 if i == j else 0.0)) / frames
+
+
 @njit
 def find_variances(table: NDArray[np.int64]) -> None:
     """Compute ``variances`` from the covariance of :class:`GainArrays`."""
@@ -141,32 +158,19 @@ def use_block(table: NDArray[np.int64], wires: float, patch: float, frames: int,
         share: Weight of the block in the offsets.
     """
     its = arrays_of(table)
-    covariance, inverse, v, step = its.covariance, its.inverse, its.v, its.step
-    by_wires, by_patch, basis_t = its.by_wires, its.by_patch, its.basis_t
+    _update_covariance(its, wires, patch, frames)
+    covariance, v, step, basis_t = its.covariance, its.v, its.step, its.basis_t
     mean, expected, offset, beyond = its.mean, its.expected, its.offset, its.beyond
-    n = v.size
-    for i in range(n):
-        for j in range(n):
-            grown = covariance[i, j] + wires * by_wires[i, j] + patch * by_patch[i, j]
-            inverse[i, j] = frames * grown
-        inverse[i, i] += 1.0
-    _invert(inverse)
-    # the gain n P (I + n P)⁻¹ = I − (I + n P)⁻¹ is also n times the covariance after the update
-    for i in range(n):
-        for j in range(n):
-            gain = -0.5 * (inverse[i, j] + inverse[j, i])
-            covariance[i, j] = (gain + (1.0 if i == j else 0.0)) / frames
     for i in range(mean.size):
         beyond[i] = mean[i] - expected[i]
+        expected[i] = 0.0
     multiply_vector(basis_t, beyond, step)
-    for i in range(n):
+    for i in range(v.size):
         total = 0.0
-        for j in range(n):
+        for j in range(v.size):
             total += covariance[i, j] * step[j]
         v[i] += frames * total
-    for i in range(mean.size):
-        expected[i] = 0.0
-    for j in range(n):
+    for j in range(v.size):
         row, value = basis_t[j], v[j]
         for i in range(mean.size):
             expected[i] += value * row[i]

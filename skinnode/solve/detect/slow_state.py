@@ -92,6 +92,7 @@ class SlowState:
         self._sum, self._seen, self._missing = np.zeros(shape), np.zeros(shape), False
         self._mean_share = 1.0 / shape[0] + 1.0 / shape[1]
         self._unit = stream.unit
+        use_block(self._arrays.table, 0.0, 0.0, 1, 0.0)  # compile the kernel
         self._floor = stream.unit * math.sqrt(3600.0) / 64.0  # a smaller drift does not matter
         self.reset()
 
@@ -130,7 +131,7 @@ class SlowState:
         self.level = self._level_at(self._base)
 
     def _level_at(self, age: int) -> tuple[int, int]:
-        """Return the level whose variances cover those of the gains when the newest frame is ``age`` frames old."""
+        """Return the level that covers the gains when the newest frame is ``age`` frames old."""
         wires, patch = self._growth.after(age * self._stream.period_s)
         wire_level = _least(WIRE_VARIANCES, self._variances[WIRES] + wires)
         mean = self._variances[MEAN] + wires * self._mean_share + patch
@@ -257,18 +258,19 @@ class SlowState:
         """Measure the drift of the stream between this block and an earlier one."""
         upper, lower = mean.shape
         means = self._means
-        means.append((mean.mean(axis=1), mean.mean(axis=0)))
+        means.append((np.add.reduce(mean, 1) / lower, np.add.reduce(mean, 0) / upper))
         if len(means) <= self._blocks_apart:
             return
         rows, columns = means.pop(0)
         by_rows, by_columns = means[-1][0] - rows, means[-1][1] - columns
         seconds = self._blocks_apart * self._block_s
         of_noise = 2.0 * noise / self._stream.block
-        common = float(by_rows.mean())
+        common = float(by_rows.sum()) / upper
         sums = 0.0
         for moved, count, other in ((by_rows, upper, lower), (by_columns, lower, upper)):
             if count > 1:
-                variance = float(((moved - moved.mean()) ** 2).sum()) / (count - 1) - of_noise / other
+                about = moved - common  # the mean of all readings is that of the rows and of the columns
+                variance = float(about @ about) / (count - 1) - of_noise / other
                 sums += variance * other / (upper + lower)
         found = sums / seconds
         most = max(1.0, WITHIN_S / self._block_s)

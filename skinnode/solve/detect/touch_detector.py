@@ -29,14 +29,9 @@ from skinnode.solve.detect.touch_kernel import (
     retest,
     see_frame,
 )
+from skinnode.solve.detect.touch_odds import bounded_exp, log_likelihood_ratio, next_log_odds, octaves_for
 from skinnode.solve.detect.touch_statistic import TouchBasis
-from skinnode.solve.detect.touch_test import (
-    TouchTest,
-    bounded_exp,
-    log_likelihood_ratio,
-    octaves_for,
-    touch_tests,
-)
+from skinnode.solve.detect.touch_test import TouchTest, touch_tests
 
 ENOUGH: Final = 0.5
 """Minimum fraction of usable readings. With fewer, the detector makes no decision."""
@@ -46,10 +41,6 @@ Noise exceeds this limit in one of 1,700,000 frames of 300 readings."""
 ODD_WIRE: Final = 8.0
 """Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data are
 checked. Noise exceeds this limit in at most one of 25,000 frames."""
-TOUCHES_PER_S: Final = 1.0 / 60.0
-"""Prior rate of touches, 1/s, for the odds."""
-TOUCH_S: Final = 1.0
-"""Prior mean duration of a touch, s, for the odds."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30
@@ -119,6 +110,8 @@ class TouchDetector:
             responses=self._basis.responses_t,
             ratios=self._basis.ratios,
             features=np.zeros((KEPT, size + gains)),
+            shift=np.zeros(upper * lower),
+            shift_features=np.zeros(size + gains),
             products=np.zeros((KEPT, size)),
             residual=np.zeros(upper),
             columns=np.zeros(lower),
@@ -130,7 +123,7 @@ class TouchDetector:
         self._arrays.ohm[:] = self._arrays.rest
         self._at, self._frames = 0, 1
         self._compute(1.0)
-        retest(self._arrays.table, self._test.rows, 0, 1)  # compile the kernels
+        retest(self._arrays.table, self._test.rows, self._slow.expected, 0, 1)  # compile the kernels
         self.reset()
 
     def _configure(self) -> None:
@@ -293,7 +286,7 @@ class TouchDetector:
     def _follow_rest(self, scaled: list[float], found: list[float]) -> bool:
         """Process a frame of an untouched patch; return whether it need not be solved."""
         limits, its = self._test.thresholds, self._arrays
-        self._update_odds(found[RATIO])
+        self._log_odds = next_log_odds(self._log_odds, found[RATIO], self._period_s)
         if scaled[0] > limits.onset[0] or scaled[1] > limits.onset[1]:
             self._begin_touch()
             return False
@@ -310,21 +303,8 @@ class TouchDetector:
 
     def _change_test(self) -> None:
         """Use the slow state's current expected changes and test."""
-        its, slow = self._arrays, self._slow
-        its.recent += (its.expected - slow.expected).ravel()
-        its.expected[:] = slow.expected
         self._use_test()
-        retest(its.table, self._test.rows, self._at, self._frames)
-
-    def _update_odds(self, log_ratio: float) -> None:
-        """Update the odds with a frame's log likelihood ratio: Bayes' rule for a two-state Markov chain."""
-        begins = min(TOUCHES_PER_S * self._period_s, 0.5)
-        ends = min(self._period_s / TOUCH_S, 0.5)
-        odds = bounded_exp(self._log_odds)
-        prior = (1.0 - ends) / ends
-        if odds < math.inf:
-            prior = (odds * (1.0 - ends) + begins) / (odds * ends + 1.0 - begins)
-        self._log_odds = log_ratio + math.log(prior)
+        retest(self._arrays.table, self._test.rows, self._slow.expected, self._at, self._frames)
 
     def _begin_touch(self) -> None:
         self.touched = True
@@ -344,7 +324,7 @@ class TouchDetector:
         if later is not self._test:
             z = later.rows @ its.features[self._at] / math.sqrt(variance)
             ratio = log_likelihood_ratio(later.statistic, self._octaves, z)
-        self._update_odds(ratio)
+        self._log_odds = next_log_odds(self._log_odds, ratio, self._period_s)
         if self._frames < KEPT:
             return
         touch, first = self._touch, (self._at + 1) % KEPT

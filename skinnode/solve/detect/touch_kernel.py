@@ -39,6 +39,10 @@ class TouchArrays(ArrayTable):
     """Noise of each reading divided by the median."""
     features: Annotated[NDArray[np.float64], "4 F"]
     """Features (Bᵀ y, Hᵀ y) of the last frames: R responses, U + K + 1 gains."""
+    shift: Annotated[NDArray[np.float64], "m"]
+    """Work array."""
+    shift_features: Annotated[NDArray[np.float64], "F"]
+    """Work array."""
     products: Annotated[NDArray[np.float64], "4 R"]
     """z of the last frames."""
     residual: Annotated[NDArray[np.float64], "U"]
@@ -79,7 +83,7 @@ def _norms(products: Float, at: int, frames: int, found: Float) -> None:
 
 @njit_part
 def _features(responses: Float, ratios: Float, y: Float, features: Float) -> None:
-    """Write Bᵀ y, and the sums Hᵀ y over each upper wire, each lower wire and the patch, into ``features``."""
+    """Write Bᵀ y, and the sums Hᵀ y over upper wires, lower wires and the patch, into ``features``."""
     size = responses.shape[0]
     upper, lower = ratios.shape
     multiply_vector(responses, y, features[:size])
@@ -99,7 +103,7 @@ def _features(responses: Float, ratios: Float, y: Float, features: Float) -> Non
 
 @njit_part
 def _log_ratio(z: Float, shares: Float, log_dets: Float, octaves: int, variance: float) -> float:
-    """Return the log of the mean of exp ½ (Σ share z² / variance − log_det) over the octaves of depth."""
+    """Return the log of the mean of exp ½ (Σ share z² / variance − log_det) over the octaves."""
     most, total = -np.inf, 0.0
     for j in range(octaves):
         row, square = shares[j], 0.0
@@ -188,11 +192,31 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
 
 
 @njit
-def retest(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> None:
-    """Recompute the features and statistics of the last frames, with another test; see :func:`see_frame`."""
+def retest(table: NDArray[np.int64], rows: Float, expected: Float, at: int, frames: int) -> None:
+    """Recompute the statistics of the last frames for other expected changes and another test.
+
+    Args:
+        table: Table of :class:`TouchArrays`.
+        rows: (R, F) matrix of the test; see :func:`see_frame`.
+        expected: (U, K) changes expected from now on.
+        at: Position of the last frame in ``recent`` and ``products``.
+        frames: Number of frames in ``recent``.
+    """
     its = arrays_of(table)
+    before, shift, of_shift = its.expected, its.shift, its.shift_features
+    upper, lower = before.shape
+    for u in range(upper):
+        for k in range(lower):
+            shift[u * lower + k] = before[u, k] - expected[u, k]
+            before[u, k] = expected[u, k]
+    _features(its.responses, its.ratios, shift, of_shift)  # features are linear in the changes
+    for one in range(4):
+        recent, features = its.recent[one], its.features[one]
+        for i in range(shift.size):
+            recent[i] += shift[i]
+        for j in range(of_shift.size):
+            features[j] += of_shift[j]
     for back in range(frames):
         one = (at - back) % 4
-        _features(its.responses, its.ratios, its.recent[one], its.features[one])
         multiply_vector(rows, its.features[one], its.products[one])
     _norms(its.products, at, frames, its.found)

@@ -14,7 +14,8 @@ u_iᵀ Bᵀ V₀⁻¹ y. Without a touch, the z_i are independent with the varia
 Bᵀ V₀⁻¹ y is a combination of Bᵀ y and Hᵀ y, the *features* of the frame, which do not depend on P. A
 statistic is therefore a small matrix that multiplies the features. The statistics for all uncertainties of
 the gains are computed before a stream starts, and choosing another one during a stream takes microseconds.
-P is diagonal: wires have one of the variances :data:`WIRE_VARIANCES`, the patch one of :data:`PATCH_VARIANCES`.
+P is diagonal: wires have one of the variances :data:`WIRE_VARIANCES`, and the patch has one of
+:data:`PATCH_VARIANCES`.
 
 The odds of touch allow for depths c times as large, for which c² μ_i replaces μ_i. The log likelihood ratio
 is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)).
@@ -46,8 +47,8 @@ LEAST_WEIGHT: Final = 0.02
 MOST_VECTORS: Final = 96
 """Maximum number of eigenvectors of the elastic prior in the test. The cost is proportional to it."""
 WIRE_VARIANCES: Final = (*(2.0 ** np.arange(-9.0, 2.0)).tolist(), 1e6)
-"""Variances of a wire's gain about the mean of its layer, in units of a reading's noise variance. The smallest
-has no effect on the test; with the largest, the gains are unknown."""
+"""Variances of a wire's gain about the mean of its layer, in units of a reading's noise variance. The
+smallest has little effect on the test; with the largest, the gains are unknown."""
 PATCH_VARIANCES: Final = (*(2.0 ** np.arange(-12.0, 0.0)).tolist(), 1e6)
 """Variances of the gain of the patch, like :data:`WIRE_VARIANCES`."""
 

@@ -11,26 +11,18 @@ between those for independent noise and those for noise that is the same in all 
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.detect.touch_statistic import (
-    DEPTH,
-    MOST_OCTAVES,
     PATCH_VARIANCES,
-    SHALLOWEST,
     WIRE_VARIANCES,
     Statistic,
     TouchBasis,
 )
 from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
-DEEPEST: Final = 0.16
-"""Maximum RMS normal displacement in the odds, layer heights."""
 WINDOWS: Final = (1, 3)
 """Numbers of frames in the means that are tested for the onset of a touch."""
 RELEASE_FRAMES: Final = 4
@@ -149,24 +141,3 @@ def _thresholds(basis: TouchBasis, wires: int, patch: int, chance: float) -> tup
         (onset, WINDOWS[1] * onset), (doubt, WINDOWS[1] * doubt), change, RELEASE_FRAMES * release
     )
     return independent, same
-
-
-def octaves_for(noise: float) -> int:
-    """Return the number of octaves of depth in the odds for the relative ``noise``."""
-    most = math.log2(DEEPEST / (DEPTH * noise * SHALLOWEST))
-    return min(1 + max(int(most), 0), MOST_OCTAVES)
-
-
-def log_likelihood_ratio(statistic: Statistic, octaves: int, z: Float) -> float:
-    """Return the log likelihood ratio of touch to no touch for a frame with the z (r,) of ``statistic``.
-
-    All ``octaves`` of depth are equally likely.
-    """
-    terms = 0.5 * (statistic.shares[:octaves] @ (z * z) - statistic.log_dets[:octaves])
-    most = float(terms.max())
-    return most + math.log(float(np.exp(terms - most).sum()) / octaves)
-
-
-def bounded_exp(value: float) -> float:
-    """Return exp(value), or inf on overflow."""
-    return math.exp(value) if value < 700.0 else math.inf

@@ -47,16 +47,17 @@ def test_exact_method_is_the_exact_tracker(layout):
         exact.reset()
 
 
-def test_a_stream_waits_for_no_table_after_preparation(monkeypatch):
+@pytest.mark.parametrize(("noise", "depth"), [(1e-5, 0.02), (3e-6, 0.0002)], ids=["deep", "slight"])
+def test_a_stream_waits_for_no_table_after_preparation(monkeypatch, noise, depth):
     """Touched, untouched, and with a wrong reading at which explanations are sought, at the stated noise."""
     layout = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_electrodes=5)
-    plain, prepared = sk.Tracker(layout), sk.Tracker(layout)
+    plain, prepared = sk.Tracker(layout, relative_noise=noise), sk.Tracker(layout, relative_noise=noise)
     prepared.prepare()
     computed: list[int] = []
     frames = []
     for step in range(24):
-        frame = frame_ohm(layout, hertz_press(layout, 0.02 * max(0, min(step - 4, 24 - step))))
-        frames.append(frame * (1 + 1e-5 * np.random.default_rng(step).normal(size=layout.shape)))
+        frame = frame_ohm(layout, hertz_press(layout, depth * max(0, min(step - 4, 24 - step))))
+        frames.append(frame * (1 + noise * np.random.default_rng(step).normal(size=layout.shape)))
         frames[-1][2, 3] *= 1.2 if step % 5 == 4 else 1.0
     for method in ("_compute", "_load_tables"):
         original = getattr(ReadingModel, method)

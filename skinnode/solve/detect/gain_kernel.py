@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.detect.gain_drift import GainFilter
 from skinnode.solve.linalg.cholesky import multiply_vector
 
+SETTLED: Final = 1e-5
+"""Relative change of the variances from block to block, below which the covariance counts as constant."""
 WIRES, MEAN = 0, 1
 """Positions of the variances in ``variances``."""
 
@@ -44,6 +46,9 @@ class GainArrays(ArrayTable):
     """Visible coordinates of the gains."""
     variances: Annotated[NDArray[np.float64], "2"]
     """Largest variance of a wire's gain about its layer's mean, and variance of the mean change."""
+    settled: Annotated[NDArray[np.float64], "3"]
+    """Growth of a wire's variance and of the patch's at the last update, and 1 if this update left the
+    covariance as it was, else 0."""
     beyond: Annotated[NDArray[np.float64], "m"]
     """Work array."""
     inverse: Annotated[NDArray[np.float64], "V V"]
@@ -71,6 +76,7 @@ def gain_arrays(filter_: GainFilter) -> GainArrays:
         covariance=np.zeros((v, v)),
         v=np.zeros(v),
         variances=np.zeros(2),
+        settled=np.zeros(3),
         beyond=np.zeros(m),
         inverse=np.zeros((v, v)),
         step=np.zeros(v),
@@ -125,7 +131,15 @@ def _find_variances(its: GainArrays) -> None:
 
 @njit_part
 def _update_covariance(its: GainArrays, wires: float, patch: float, frames: int) -> None:
-    """Let the covariance grow, and reduce it by a block; the arguments are those of :func:`use_block`."""
+    """Let the covariance grow, and reduce it by a block; the arguments are those of :func:`use_block`.
+
+    Most blocks of a stream follow each other at once, so the covariance soon stays the same.
+    """
+    settled, variances = its.settled, its.variances
+    same = settled[0] == wires and settled[1] == patch
+    if same and settled[2] == 1.0:
+        return
+    wires_before, mean_before = variances[WIRES], variances[MEAN]
     covariance, inverse, by_wires, by_patch = its.covariance, its.inverse, its.by_wires, its.by_patch
     n = covariance.shape[0]
     for i in range(n):
@@ -138,12 +152,20 @@ def _update_covariance(its: GainArrays, wires: float, patch: float, frames: int)
         for j in range(n):
             gain = -0.5 * (inverse[i, j] + inverse[j, i])
             covariance[i, j] = (gain + (1.0 if i == j else 0.0)) / frames
+    _find_variances(its)
+    constant = (
+        abs(variances[WIRES] - wires_before) <= SETTLED * wires_before
+        and abs(variances[MEAN] - mean_before) <= SETTLED * mean_before
+    )
+    settled[0], settled[1], settled[2] = wires, patch, 1.0 if same and constant else 0.0
 
 
 @njit
 def find_variances(table: NDArray[np.int64]) -> None:
-    """Compute ``variances`` from the covariance of :class:`GainArrays`."""
-    _find_variances(arrays_of(table))
+    """Compute ``variances`` after the covariance of :class:`GainArrays` was set."""
+    its = arrays_of(table)
+    its.settled[2] = 0.0
+    _find_variances(its)
 
 
 @njit
@@ -177,4 +199,3 @@ def use_block(table: NDArray[np.int64], wires: float, patch: float, frames: int,
     for i in range(mean.size):
         offset[i] += share * (mean[i] - expected[i] - offset[i])
         expected[i] += offset[i]
-    _find_variances(its)

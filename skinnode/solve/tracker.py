@@ -118,7 +118,7 @@ class Tracker:
     def prepare(self) -> None:
         """Compute the tables that would otherwise delay the first frames of a touch by up to 0.1 s.
 
-        For the reference patch, this takes 0.25 s and 85 MB. Trackers of the same layout share the tables.
+        For the reference patch, this takes 0.6 s and 200 MB. Trackers of the same layout share the tables.
         The host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()

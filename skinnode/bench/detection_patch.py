@@ -81,14 +81,14 @@ class Patch:
         detector, onsets, untouched = self.detector, 0, 0
         before = detector.touched
         for first in range(0, frames, BLOCK):
-            for ohm in self._rest_block(min(BLOCK, frames - first)):
+            for ohm in self.rest_block(min(BLOCK, frames - first)):
                 touched = bool(detector.see(ohm).touched)
                 onsets += touched and not before
                 untouched += not touched
                 before = touched
         return onsets, untouched
 
-    def _rest_block(self, frames: int) -> Float:
+    def rest_block(self, frames: int) -> Float:
         """Return the next resistances (frames, U, K) of the untouched patch, ohm."""
         errors = []
         for gains, rates in ((self._upper, self._rates[0]), (self._lower, self._rates[1])):

@@ -17,6 +17,8 @@ PERIOD_S: Final = 0.08
 """Default scan period, s."""
 FALSE_ALARMS_PER_HOUR: Final = 0.1
 DRIFT: Final = 0.01
+BLOCK: Final = 500
+"""Number of frames generated at a time by :meth:`Patch.rest_long`."""
 
 
 @dataclass(eq=False)
@@ -64,6 +66,47 @@ class Patch:
         """Pass frames of the untouched patch to the detector."""
         for _ in range(frames):
             self.see(self.rest_ohm)
+
+    def rest_long(self, frames: int) -> tuple[int, int]:
+        """Pass many frames of the untouched patch to the detector.
+
+        The frames are generated in blocks, which takes a tenth of the time of :meth:`see`.
+
+        Args:
+            frames: Number of frames.
+
+        Returns:
+            The number of touches that the detector reports, and the number of frames without a touch.
+        """
+        detector, onsets, untouched = self.detector, 0, 0
+        before = detector.touched
+        for first in range(0, frames, BLOCK):
+            for ohm in self.rest_block(min(BLOCK, frames - first)):
+                touched = bool(detector.see(ohm).touched)
+                onsets += touched and not before
+                untouched += not touched
+                before = touched
+        return onsets, untouched
+
+    def rest_block(self, frames: int) -> Float:
+        """Return the next resistances (frames, U, K) of the untouched patch, ohm."""
+        errors = []
+        for gains, rates in ((self._upper, self._rates[0]), (self._lower, self._rates[1])):
+            steps = np.zeros((frames, *gains.shape))
+            if self.drift == "steady":
+                steps += rates
+            elif self.drift == "walk":
+                steps += self._walk * self.rng.standard_normal(steps.shape)
+            steps = gains + np.cumsum(steps, axis=0)
+            gains[:] = steps[-1]
+            errors.append(steps)
+        ohm = self.rng.standard_normal((frames, *self.rest_ohm.shape))
+        ohm *= self.noise
+        ohm += 1.0
+        ohm *= self.rest_ohm
+        ohm *= 1.0 + errors[0]
+        ohm *= 1.0 + errors[1][:, None, :]
+        return ohm
 
     def settle(self) -> None:
         """Release the patch for five seconds; if the touch does not end, reset and retrain the detector."""

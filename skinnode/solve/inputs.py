@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -33,16 +33,27 @@ class CodeMap:
     """Relative standard deviation of the resistances before quantization."""
     gain: Float | None = None
     """(U, K) or (U, 1) gain of the front end; None for a gain of 1."""
+    unknown: NDArray[np.bool_] | None = field(init=False)
+    """(U, K) mask of the crossings without a baseline; None if there are none."""
+
+    def __post_init__(self) -> None:
+        unknown = ~((self.baseline_ohm > 0) & (self.baseline_ohm < np.inf))
+        object.__setattr__(self, "unknown", unknown if unknown.any() else None)
 
     def decode(self, codes: NDArray[np.uint32]) -> tuple[Float, NDArray[np.bool_]]:
         """Return the resistances (U, K), ohm, and a mask (U, K) of the valid codes.
 
         The resistance of an invalid code is NaN.
         """
-        valid = (codes <= self.steps) & (self.baseline_ohm > 0) & (self.baseline_ohm < np.inf)
+        valid = codes <= self.steps
+        if self.unknown is not None:
+            valid &= ~self.unknown
         ohm = (self.lo + codes * self.step) * self.baseline_ohm
-        ohm = ohm if self.gain is None else ohm * self.gain
-        return np.where(valid, ohm, np.nan), valid
+        if self.gain is not None:
+            ohm *= self.gain
+        if not valid.all():
+            ohm[~valid] = np.nan
+        return ohm, valid
 
 
 class CodeDecoder:

@@ -554,6 +554,9 @@ def test_deadline_gives_up_in_time_and_recovers(staggered, monkeypatch):
     assert np.abs(deviations(field, moved)).max() < 5
     step = 1e-3  # a held frame needs no time
     assert tracker.update(noisy(frame_ohm(staggered, moved), rng)).trusted
+    step = 10e-3  # the deadline passes while the frame is compared with the last field
+    late = tracker.update(noisy(frame_ohm(staggered, moved), rng))
+    assert set(late.status) == {sk.Status.DEADLINE}
 
 
 def test_covariance_belongs_to_the_field(small):

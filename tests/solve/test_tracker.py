@@ -73,6 +73,32 @@ def test_a_stream_waits_for_no_table_after_preparation(monkeypatch):
         np.testing.assert_array_equal(plain.update(frame).displacement_m, field.displacement_m)
 
 
+@pytest.mark.parametrize("depth", [0.0, 0.002])
+def test_slight_touches_in_codes_wait_for_no_table_either(monkeypatch, depth):
+    """A reading is wrong by 0.1 %; explanations are sought at the smallest prior scales."""
+    layout = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_electrodes=5)
+    rest, scale, noise = frame_ohm(layout, np.zeros_like(layout.upper_m)), CodeScale(16), 3e-6
+    codes = CodeMap(rest, scale.lo, scale.step, scale.steps, scale.relative_std * rest, noise)
+    tracker = sk.Tracker(layout, relative_noise=noise, baseline_ohm=rest, codes=codes)
+    tracker.prepare()
+    computed: list[int] = []
+    original = ReadingModel._load_tables
+
+    def counted(self, number):
+        computed.append(number)
+        return original(self, number)
+
+    monkeypatch.setattr(ReadingModel, "_load_tables", counted)
+    found = 0
+    for step in range(24):
+        frame = frame_ohm(layout, hertz_press(layout, depth * max(0, min(step - 4, 24 - step))))
+        frame *= 1 + noise * np.random.default_rng(step).normal(size=layout.shape)
+        frame[2, 3] *= 1.001 if step % 5 == 4 else 1.0
+        found += bool(tracker.update_codes(encode(frame, rest, scale))[0].faults)
+    assert found
+    assert not computed
+
+
 def test_unknown_method_is_named(layout):
     with pytest.raises(ValueError, match="method: got 'magic'"):
         sk.Tracker(layout, method="magic")

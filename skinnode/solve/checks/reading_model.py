@@ -28,13 +28,14 @@ from skinnode.solve.checks.wire_tests import WireTables, wire_blocks
 from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior, bonded_response
 
-USUAL: Final = (-17, -3)
-"""Range of log2 s for which load tables are computed in advance, where s is the prior scale in pitches."""
+USUAL: Final = (-25, -3)
+"""Range of log2 s for which load tables are computed in advance, where s is the prior scale in pitches. The
+search for explanations of slight touches in low noise uses the smallest scales."""
 MOST_USUAL: Final = 9
 """Number of prior scales prepared for a large patch: the largest scales in :data:`USUAL`."""
-STORED: Final = 125_000_000
+STORED: Final = 180_000_000
 """Maximum size of all stored tables, bytes. Computing the tables during a stream would delay the first
-touched frame by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, products with
+touched frame by up to 0.1 s. The tables of the reference patch take 176 MB. For larger patches, products with
 the loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
 """Range of log2 κ; covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
@@ -132,7 +133,7 @@ class ReadingModel:
     def prepare(self, sigma: float) -> None:
         """Compute the tables that a stream with the relative noise ``sigma`` usually needs.
 
-        Other tables are computed on first use. For the reference patch, this method takes 0.25 s.
+        Other tables are computed on first use. For the reference patch, this method takes 0.4 s.
         """
         octaves = np.log2(self.kappa * sigma)
         usual: list[int] = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()

@@ -1,14 +1,18 @@
-"""Gain drift of a patch: its prior, and the steady-state Kalman filter that tracks the gains.
+"""Gain drift of a patch: its prior, and the Kalman filter that tracks the gains.
 
 The logarithm of each reading contains three gains: those of its upper wire, its lower wire and the patch. The
 patch's gain changes with temperature. Each gain is a random walk. The filter estimates the gains from blocks
-of untouched frames, so its error is the steady-state error plus the drift since the last block. Over minutes,
-a steady drift at an unknown rate dominates the random walk, because its variance grows with the square of
-time. All variances are in units of a reading's noise variance.
+of untouched frames, so its error is the error after the last block plus the drift since then. Over minutes, a
+steady drift at an unknown rate dominates the random walk, because its variance grows with the square of time.
+
+A change common to all upper wires looks like a change common to all lower wires, or like one of the patch.
+The filter therefore uses coordinates v in which every change is visible: the readings change by Q v, with
+orthonormal columns of Q. All variances are in units of a reading's noise variance.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,73 +29,112 @@ temperature changes faster than its wires age."""
 MEASURED_S: Final = 2.0
 """Interval over which a stream's random walk is measured, s. Over this interval, the measured random walk
 includes any steady drift."""
-_SETTLED: Final = 1e-4
-"""Relative change in the readings' variance from block to block at which the recursion counts as steady."""
-_ROUNDS: Final = 2000
-"""Maximum number of blocks in the recursion. The slowest drift needs 300."""
+_VISIBLE: Final = 1e-9
+"""Minimum singular value of a visible combination of gains, relative to the largest."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Growth of the gains' variances with time, in units of the readings' noise variance."""
+
+    drift: float
+    """Standard deviation of the random walk of a wire's gain after one hour, divided by the noise."""
+    patch_drift: float
+    """Standard deviation of the random walk of the patch's gain after one hour, divided by the noise."""
+    steady: float
+    """Standard deviation of a wire's steady drift after one hour, divided by the noise."""
+    patch_steady: float
+    """Standard deviation of the patch's steady drift after one hour, divided by the noise."""
+
+    def after(self, seconds: float) -> tuple[float, float]:
+        """Return the growth of a wire's variance and of the patch's variance in ``seconds``."""
+        hours, steady_h = seconds / 3600.0, max(seconds - MEASURED_S, 0.0) / 3600.0
+        return (
+            hours * self.drift**2 + (steady_h * self.steady) ** 2,
+            hours * self.patch_drift**2 + (steady_h * self.patch_steady) ** 2,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class GainFilter:
-    """Kalman filter for the gains, with U + K + 1 states: upper wires, lower wires and patch."""
+    """Constants of the Kalman filter for the gains of one kind of patch.
+
+    The filter uses V = U + K − 1 visible coordinates v.
+    :mod:`skinnode.solve.detect.gain_kernel` contains the filter.
+    """
 
     effect: Float
-    """(m, U + K + 1) effect of each gain on the m = U K readings, in units of their noise."""
-    walk: Float
-    """(U + K + 1,) growth of each gain's random-walk variance per second."""
-    rate: Float
-    """(U + K + 1,) variance of each gain's steady drift in one second."""
-    steady: Float
-    """(U + K + 1, U + K + 1) steady-state covariance after each block."""
-    frames: int
-    """Number of frames in a block."""
+    """(m, U + K + 1) effect of each gain (upper wires, lower wires, patch) on the m = U K readings."""
+    basis_t: Float
+    """(V, m) matrix Qᵀ with orthonormal rows."""
+    to_gains: Float
+    """(U + K + 1, V) gains for given v. A combination of gains that no reading shows is zero."""
+    by_wires: Float
+    """(V, V) covariance of v if the gains of all wires have a variance of 1."""
+    by_patch: Float
+    """(V, V) covariance of v if the gain of the patch has a variance of 1."""
+    of_uppers: Float
+    """(V, V) matrix whose product with the covariance of v, summed over all elements, is the variance of an
+    upper wire's gain about the mean of the upper wires."""
+    of_lowers: Float
+    """(V, V) matrix for the lower wires, like ``of_uppers``."""
+    of_mean: Float
+    """(V,) coefficients of the mean change of all readings."""
 
-    def correction(self, covariance: Float) -> tuple[Float, Float]:
-        """Return the Kalman gain (states, m) for a block mean, and the covariance after the update.
+    @classmethod
+    def of(cls, shape: tuple[int, int], ratios: bytes) -> GainFilter:
+        """Return the filter of a patch from a cache.
 
         Args:
-            covariance: Covariance of the gains before the update.
+            shape: Numbers U and K of upper and lower wires.
+            ratios: (U, K) noise of each reading divided by the median, as float64.
         """
-        measured = self.effect.T @ self.effect * self.frames
-        after = np.linalg.inv(np.linalg.inv(covariance) + measured)
-        return np.asarray(after @ self.effect.T * self.frames), np.asarray(after)
+        return _filter(shape, ratios)
 
-    def after(self, seconds: float) -> Float:
-        """Return the gains' covariance ``seconds`` after the last block, in the steady state."""
-        return np.asarray(self.steady + np.diag(self.growth(seconds)))
-
-    def growth(self, seconds: float) -> Float:
-        """Return the growth (U + K + 1,) of each gain's variance in ``seconds``."""
-        steady_s = max(seconds - MEASURED_S, 0.0)
-        return np.asarray(seconds * self.walk + steady_s**2 * self.rate)
+    def start(self, variances: Float) -> Float:
+        """Return the covariance (V, V) of v for independent gains with the given ``variances``."""
+        seen = self.basis_t @ self.effect
+        return np.asarray((seen * variances) @ seen.T)
 
 
-def gain_filter(sigma: Float, drift: float, patch_drift: float, frames: int, block_s: float) -> GainFilter:
-    """Return the filter for one patch.
+def effect_of(shape: tuple[int, int], ratios: Float) -> Float:
+    """Return the effect (m, U + K + 1) of the gains on the readings, in units of the median noise.
 
     Args:
-        sigma: (U, K) relative noise of the readings.
-        drift: Standard deviation of the change in a wire's gain in one hour.
-        patch_drift: Standard deviation of the change in the patch's gain in one hour.
-        frames: Number of frames in a block.
-        block_s: Duration of a block, s.
+        shape: Numbers U and K of upper and lower wires.
+        ratios: (U, K) noise of each reading divided by the median.
     """
-    upper, lower = sigma.shape
+    upper, lower = shape
     effect = np.zeros((upper, lower, upper + lower + 1))
     effect[np.arange(upper), :, np.arange(upper)] = 1.0
     effect[:, np.arange(lower), upper + np.arange(lower)] = 1.0
     effect[..., -1] = 1.0
-    unit = float(np.median(sigma))
-    effect = (effect * (unit / sigma)[..., None]).reshape(sigma.size, -1)
-    walk = np.full(upper + lower + 1, (drift / unit) ** 2 / 3600.0)
-    walk[-1] = (patch_drift / unit) ** 2 / 3600.0
-    covariance, measured = np.diag(walk * 60.0), effect.T @ effect * frames
-    visible = 0.0  # gains common to all upper or to all lower wires look the same, so variances grow
-    for _ in range(_ROUNDS):
-        covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance + np.diag(walk * block_s)) + measured))
-        before, visible = visible, float(np.einsum("ij,ji->", covariance, measured))
-        if abs(visible - before) <= _SETTLED * visible:
-            break
-    rate = np.full_like(walk, (DRIFT / unit / 3600.0) ** 2)
-    rate[-1] = (PATCH_DRIFT / unit / 3600.0) ** 2
-    return GainFilter(effect, walk, rate, covariance, frames)
+    return np.ascontiguousarray((effect / ratios[..., None]).reshape(upper * lower, -1))
+
+
+@functools.lru_cache(maxsize=8)
+def _filter(shape: tuple[int, int], ratios: bytes) -> GainFilter:
+    upper, lower = shape
+    effect = effect_of(shape, np.frombuffer(ratios).reshape(shape))
+    basis, singular, turn = np.linalg.svd(effect, full_matrices=False)
+    seen = singular > _VISIBLE * singular[0]
+    basis_t, to_v = np.ascontiguousarray(basis[:, seen].T), singular[seen, None] * turn[seen]
+    to_gains = np.ascontiguousarray(turn[seen].T / singular[seen])
+    wires = to_v[:, :-1]
+    mean = np.concatenate([np.full(upper, 1.0 / upper), np.full(lower, 1.0 / lower), [1.0]])
+
+    def contrast(first: int, count: int) -> Float:
+        rows = to_gains[first : first + count]
+        rows = rows - rows.mean(axis=0)
+        return np.ascontiguousarray(rows.T @ rows / max(count - 1, 1))
+
+    return GainFilter(
+        effect=effect,
+        basis_t=basis_t,
+        to_gains=to_gains,
+        by_wires=np.ascontiguousarray(wires @ wires.T),
+        by_patch=np.outer(to_v[:, -1], to_v[:, -1]),
+        of_uppers=contrast(0, upper),
+        of_lowers=contrast(upper, lower),
+        of_mean=np.ascontiguousarray(to_gains.T @ mean),
+    )

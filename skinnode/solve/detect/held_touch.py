@@ -38,6 +38,8 @@ class HeldTouch:
     """Test used at the onset."""
     average: Float
     """(m,) average change of the readings, excluding the last frames."""
+    average_features: Float
+    """Features of ``average``; see :class:`skinnode.solve.detect.touch_statistic.TouchBasis`."""
     period_s: float
     """Scan period, s."""
     creep: float
@@ -50,29 +52,32 @@ class HeldTouch:
     _like_rest: int = 0  # number of successive frames that drift could explain
     _lighter: bool = True  # False from a frame that drift cannot explain until a change towards rest
 
-    def follow(self, recent: Float, oldest: Float, variance: float, later: TouchTest) -> bool | None:
+    def follow(
+        self, features: Float, at: int, oldest: Float, variance: float, later: TouchTest
+    ) -> bool | None:
         """Process a frame; return whether the touch ended, or None if it ended and creep remains.
 
         Args:
-            recent: (4, m) changes of the readings in the last four frames.
+            features: (4, F) features of the last four frames.
+            at: Index of the first of these frames in ``features``.
             oldest: (m,) changes of the readings in the first of these frames.
             variance: Noise variance of the stream, relative to the stated variance.
             later: Test that allows for the drift since the onset.
         """
         self.frames += 1
-        now = recent.mean(axis=0)
-        energy = float(((self.test.rows @ now) ** 2).sum()) / variance
+        now = 0.25 * (features[0] + features[1] + features[2] + features[3])
+        energy = _energy(self.test, now) / variance
         self.peak = max(self.peak, energy)
         within_drift = KEPT * energy
         if later is not self.test:
-            within_drift = KEPT * float(((later.rows @ now) ** 2).sum()) / variance
-        self._follow_change(now, oldest, variance, later)
-        if within_drift > later.onset[1]:
+            within_drift = KEPT * _energy(later, now) / variance
+        self._follow_change(now, features[at], oldest, variance, later)
+        if within_drift > later.thresholds.onset[1]:
             self._lighter = False  # drift cannot explain this; wait for the next change towards rest
-        agrees = within_drift < later.release
+        agrees = within_drift < later.thresholds.release
         self._like_rest = self._like_rest + 1 if agrees else 0
         forgotten = self._like_rest * self.period_s >= FORGOTTEN_S
-        if KEPT * energy < self.test.release or (self._lighter and agrees) or forgotten:
+        if KEPT * energy < self.test.thresholds.release or (self._lighter and agrees) or forgotten:
             return True
         if self._still * self.period_s >= RESIDUE_S and energy < self.residue:
             return None
@@ -88,18 +93,26 @@ class HeldTouch:
         """Whether creep from an earlier touch may explain the whole touch."""
         return self.creep > RESIDUE**2 * self.peak
 
-    def _follow_change(self, now: Float, oldest: Float, variance: float, later: TouchTest) -> None:
+    def _follow_change(
+        self, now: Float, oldest_features: Float, oldest: Float, variance: float, later: TouchTest
+    ) -> None:
         """Detect a change by comparing the last frames with the average of the touch before them."""
         share = 1.0 / min(max(1.0, AVERAGED_S / self.period_s), self.frames)
         spread = variance * (1.0 / KEPT + share)
-        average = self.average
-        if float(((self.test.rows @ (now - average)) ** 2).sum()) > spread * self.test.change:
+        average = self.average_features
+        if _energy(self.test, now - average) > spread * self.test.thresholds.change:
             self._still = 0
-            lighter = float(((later.rows @ now) ** 2).sum()) < float(((later.rows @ average) ** 2).sum())
-            self._lighter = self._lighter or lighter
+            self._lighter = self._lighter or _energy(later, now) < _energy(later, average)
         else:
             self._still += 1
-        average += share * (oldest - average)
+        average += share * (oldest_features - average)
+        self.average += share * (oldest - self.average)
+
+
+def _energy(test: TouchTest, features: Float) -> float:
+    """Return ‖z‖² of the ``features``."""
+    z = test.rows @ features
+    return float(z @ z)
 
 
 def creep_of(peak: float, since_s: float) -> float:

@@ -12,15 +12,18 @@ gains follow the readings, and the slower the presses that can still be detected
 
 from __future__ import annotations
 
+import bisect
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
-from skinnode.solve.detect.gain_drift import DRIFT, MEASURED_S, PATCH_DRIFT
-from skinnode.solve.detect.touch_test import PatchNoise, TouchTest, filter_of, touch_test
+from skinnode.solve.detect.gain_drift import DRIFT, MEASURED_S, PATCH_DRIFT, GainFilter, Growth
+from skinnode.solve.detect.gain_kernel import MEAN, WIRES, find_variances, gain_arrays, use_block
+from skinnode.solve.detect.touch_statistic import PATCH_VARIANCES, WIRE_VARIANCES
 
 BLOCK_S: Final = 0.25
 """Minimum duration of a block, s."""
@@ -28,12 +31,8 @@ BLOCK: Final = 4
 """Minimum number of frames in a block."""
 HELD_BACK: Final = 2.0
 """Maximum age of the newest frame in the estimate while the patch is untouched, blocks."""
-COARSER: Final = 4.0
-"""Ratio of successive ages for which tests are computed."""
-MOST_LEVEL: Final = 12
-"""Maximum level of a test, for gains that are several months old."""
 FINER: Final = math.sqrt(2.0)
-"""Ratio of successive drifts for which tests are computed."""
+"""Ratio of successive drifts that the detector distinguishes."""
 PRIOR: Final = 8.0
 """Number of independent drift measurements after which the stated drift no longer counts."""
 WITHIN_S: Final = 120.0
@@ -49,88 +48,94 @@ CREEP: Final = 6.0
 :data:`OFFSET_S`. The averaging time increases because rubber creeps back more and more slowly."""
 START_S: Final = 60.0
 """Assumed time from the measurement of the baseline to the first frame, s."""
-CONVERGED: Final = 1.1
-"""Ratio of the readings' variance to its steady-state value, below which the gains have settled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Facts about a stream that its slow state needs."""
+
+    filter: GainFilter
+    """Filter for the gains."""
+    unit: float
+    """Median relative noise of the readings."""
+    period_s: float
+    """Scan period, s."""
+    block: int
+    """Number of frames in a block."""
+    start: Float | None
+    """(U + K + 1,) initial variances of the gains, as squares of relative errors; None to assume the drift
+    over :data:`START_S`."""
 
 
 class SlowState:
     """Slow state of one stream.
 
     Args:
-        patch: Patch and noise.
-        start: Initial variances (U + K + 1,) of the gains, as squares of relative errors; None to assume the
-            drift over :data:`START_S`.
+        stream: Facts about the stream.
+        shape: Numbers U and K of upper and lower wires.
 
     Attributes:
         expected: (U, K) expected changes of an untouched patch's readings, in units of their noise.
         age: Number of frames since the newest frame in the estimate.
         offset_share: Error variance of the offsets, relative to the noise variance.
+        level: Indices in ``WIRE_VARIANCES`` and ``PATCH_VARIANCES`` of the variances that cover the current
+            uncertainty of the gains. They select the test.
     """
 
-    def __init__(self, patch: PatchNoise, start: Float | None = None) -> None:
-        self._patch, self._start = patch, start
-        upper, lower = patch.layout.shape
-        self.expected = np.zeros((upper, lower))
-        self._block_s = patch.block * patch.period_s
-        self._base = int(HELD_BACK * patch.block)
+    def __init__(self, stream: Stream, shape: tuple[int, int]) -> None:
+        self._stream, self._filter, self._shape = stream, stream.filter, shape
+        self._arrays = gain_arrays(stream.filter)
+        self.expected = self._arrays.expected.reshape(shape)
+        self._block_s = stream.block * stream.period_s
+        self._base = int(HELD_BACK * stream.block)
         self._blocks_apart = max(1, round(MEASURED_S / self._block_s))
-        self._sum, self._seen = np.zeros((upper, lower)), np.zeros((upper, lower))
-        unit = float(np.median(patch.noise))
-        self._unit = unit
-        self._floor = unit * math.sqrt(3600.0) / 64.0  # a smaller drift does not matter
+        self._sum, self._seen, self._missing = np.zeros(shape), np.zeros(shape), False
+        self._mean_share = 1.0 / shape[0] + 1.0 / shape[1]
+        self._unit = stream.unit
+        use_block(self._arrays.table, 0.0, 0.0, 1, 0.0)  # compile the kernel
+        self._floor = stream.unit * math.sqrt(3600.0) / 64.0  # a smaller drift does not matter
         self.reset()
 
     def reset(self) -> None:
         """Forget the stream."""
-        upper, lower = self._patch.layout.shape
-        self._gains, self._offset = np.zeros(upper + lower + 1), np.zeros((upper, lower))
-        self.expected[:] = 0.0
-        self._filled, self._waiting = 0, False
-        self._waiting_mean = np.zeros((upper, lower))
+        gains = sum(self._shape) + 1
+        its = self._arrays
+        its.v[:], its.offset[:], its.expected[:] = 0.0, 0.0, 0.0
+        self._clear_block()
+        self._waiting = False
+        self._waiting_mean = np.zeros(self._shape)
         self._measured, self._weight = 0.0, 0.0  # drift: mean of the measurements, and their number
         self._patch_measured = 0.0
         self._means: list[tuple[Float, Float]] = []
         self._frames = 0  # number of frames in the offsets
         self._released: int | None = None  # number of frames since the last release
         self._set_drift(DRIFT, PATCH_DRIFT)
-        self.age = 0
-        start = self._filter.growth(START_S) if self._start is None else self._start / self._unit**2
-        self._covariance: Float | None = self._filter.steady + np.diag(start)
-        self._level = self._level_for(self._covariance)
+        wires, patch = self._growth.after(START_S)
+        variances = np.append(np.full(gains - 1, wires), patch)
+        if self._stream.start is not None:
+            variances = self._stream.start / self._unit**2
         self.offset_share = 0.0
+        its.covariance[:] = self._filter.start(variances)
+        find_variances(its.table)
+        self._set_age(0)
 
     def _set_drift(self, drift: float, patch_drift: float) -> None:
         self._drift, self._patch_drift = drift, patch_drift
-        self._filter = filter_of(self._patch, drift, patch_drift)
-        effect = self._filter.effect
-        self._visible = effect.T @ effect
-        self._steady_variance = float(np.einsum("ij,ji->", self._filter.steady, self._visible))
-        self._steady_gain = self._filter.correction(
-            self._filter.steady + np.diag(self._filter.walk * self._block_s)
-        )[0]
+        unit = self._unit
+        self._growth = Growth(drift / unit, patch_drift / unit, DRIFT / unit, PATCH_DRIFT / unit)
 
-    def _level_for(self, covariance: Float) -> int:
-        """Return the lowest level whose test covers the given covariance of the gains."""
-        variance = float(np.einsum("ij,ji->", covariance, self._visible)) - self._steady_variance
-        level, seconds, diagonal = 0, self._base * self._patch.period_s, self._visible.diagonal()
-        while level < MOST_LEVEL and (self._filter.growth(seconds) * diagonal).sum() < 0.999 * variance:
-            level, seconds = level + 1, COARSER * seconds
-        return level
+    def _set_age(self, age: int) -> None:
+        """Set the age of the newest frame in the estimate."""
+        self.age = age
+        self._variances = self._arrays.variances.tolist()
+        self.level = self._level_at(self._base)
 
-    @property
-    def test(self) -> TouchTest:
-        """Test for the current uncertainty of the gains."""
-        return self.test_at(self._level)
-
-    def test_at(self, level: int) -> TouchTest:
-        """Return the test for gains that are :data:`HELD_BACK` · 4^``level`` blocks old."""
-        seconds = self._base * self._patch.period_s * COARSER**level
-        return touch_test(self._patch, self._drift, self._patch_drift, seconds)
-
-    @property
-    def level(self) -> int:
-        """Level of the current test."""
-        return self._level
+    def _level_at(self, age: int) -> tuple[int, int]:
+        """Return the level that covers the gains when the newest frame is ``age`` frames old."""
+        wires, patch = self._growth.after(age * self._stream.period_s)
+        wire_level = _least(WIRE_VARIANCES, self._variances[WIRES] + wires)
+        mean = self._variances[MEAN] + wires * self._mean_share + patch
+        return wire_level, _least(PATCH_VARIANCES, mean - WIRE_VARIANCES[wire_level] * self._mean_share)
 
     @property
     def drift(self) -> float:
@@ -140,10 +145,10 @@ class SlowState:
     @property
     def gains(self) -> Float:
         """(U + K + 1,) relative changes in conductance of the upper wires, the lower wires and the patch."""
-        return self._gains * self._unit
+        return np.asarray(self._filter.to_gains @ self._arrays.v) * self._unit
 
     def collect(self, y: Float, present: NDArray[np.bool_] | None, noise: float) -> bool:
-        """Add an untouched frame; return whether :attr:`expected` or :attr:`test` changed.
+        """Add an untouched frame; return whether :attr:`expected` or :attr:`level` changed.
 
         Args:
             y: (U, K) unexpected changes of the readings, in units of their noise.
@@ -152,20 +157,31 @@ class SlowState:
         """
         self._pass_frame()
         self._sum += y
-        self._sum += self.expected if present is None else np.where(present, self.expected, 0.0)
-        self._seen += 1.0 if present is None else present
+        if present is not None:
+            if not self._missing:
+                self._seen[:], self._missing = self._filled, True
+            self._seen += present
+        elif self._missing:
+            self._seen += 1.0
         self._filled += 1
-        if self._filled < self._patch.block:
+        if self._filled < self._stream.block:
             return self._grow()
-        mean = np.divide(self._sum, self._seen, out=self.expected.copy(), where=self._seen > 0.0)
-        self._sum[:], self._seen[:], self._filled = 0.0, 0.0, 0
+        if self._missing:
+            beyond = np.divide(self._sum, self._seen, out=np.zeros(self._shape), where=self._seen > 0.0)
+        else:
+            beyond = self._sum / self._filled
+        mean = self.expected + beyond
+        self._clear_block()
         if self._waiting:
             self._use(self._waiting_mean, noise)
         self._waiting_mean, self._waiting = mean, True
         return True
 
+    def _clear_block(self) -> None:
+        self._sum[:], self._filled, self._missing = 0.0, 0, False
+
     def skip(self) -> bool:
-        """Count a frame without using it; return whether :attr:`test` changed."""
+        """Count a frame without using it; return whether :attr:`level` changed."""
         self._pass_frame()
         return self._grow()
 
@@ -176,19 +192,15 @@ class SlowState:
 
     def _grow(self) -> bool:
         """Adapt the level to the age of the gains; return whether the level changed."""
-        if self.age <= self._base and self._covariance is None:
+        if self.age <= self._base:
             return False
-        covariance = self._filter.steady if self._covariance is None else self._covariance
-        before = self._level
-        walked = np.diag(self._filter.growth(self.age * self._patch.period_s))
-        self._level = max(
-            self._level_for(covariance + walked), self._level if self._covariance is None else 0
-        )
-        return self._level != before
+        before, self.level = self.level, self._level_at(self.age)
+        return self.level != before
 
     def discard(self) -> None:
         """Discard the frames that have not been used yet, because a touch was detected."""
-        self._sum[:], self._seen[:], self._filled, self._waiting = 0.0, 0.0, 0, False
+        self._clear_block()
+        self._waiting = False
         self._means.clear()
 
     def released(self, residue: Float | None = None) -> None:
@@ -200,9 +212,9 @@ class SlowState:
         """
         self._released = 0
         if residue is not None:
-            self._offset += residue
-            self.expected += residue
-            self._covariance, self.age, self._level = None, 0, 0
+            self._arrays.offset += residue.ravel()
+            self._arrays.expected += residue.ravel()
+            self._set_age(0)
 
     def carry_on(self, gains: Float, expected: Float) -> None:
         """Continue with the gains and expected changes of the same stream at a different noise.
@@ -211,40 +223,28 @@ class SlowState:
             gains: (U + K + 1,) relative changes in conductance; see :attr:`gains`.
             expected: (U, K) expected changes, in units of the noise.
         """
-        self._gains = gains / self._unit
-        by_gains = (self._filter.effect @ self._gains).reshape(expected.shape)
-        self._offset = expected - by_gains
-        self.expected[:] = expected
+        its = self._arrays
+        its.v[:] = self._filter.basis_t @ (self._filter.effect @ (gains / self._unit))
+        its.expected[:] = expected.ravel()
+        its.offset[:] = its.expected - its.v @ its.basis_t
 
     def _use(self, mean: Float, noise: float) -> None:
         """Estimate the gains and offsets from the mean of a block."""
-        period_s = self._patch.period_s
+        block, its = self._stream.block, self._arrays
         self._measure_drift(mean, noise)
-        beyond = mean - self.expected
-        since = self.age - 2 * self._patch.block  # frames since the last block that was used
-        if self._covariance is None and since * period_s <= 2.5 * self._block_s:
-            gain = self._steady_gain
-        else:
-            covariance = self._filter.steady if self._covariance is None else self._covariance
-            gain, after = self._filter.correction(
-                covariance + np.diag(self._filter.growth(max(since, 1) * period_s))
-            )
-            variance = float(np.einsum("ij,ji->", after, self._visible))
-            self._covariance = None if variance <= CONVERGED * self._steady_variance else after
-        self._gains += gain @ beyond.ravel()
-        by_gains = (self._filter.effect @ self._gains).reshape(mean.shape)
+        since = max(self.age - 2 * block, 0)  # frames since the last block that was used
+        wires, patch = self._growth.after((since + block) * self._stream.period_s)
         share = self._offset_weight()
-        self._offset += share * (mean - by_gains - self._offset)
-        self.offset_share = 0.5 * share / self._patch.block
-        np.add(by_gains, self._offset, out=self.expected)
-        self.age = 2 * self._patch.block - self._patch.block
-        self._level = 0 if self._covariance is None else self._level_for(self._covariance)
+        its.mean[:] = mean.ravel()
+        use_block(its.table, wires, patch, block, share)
+        self.offset_share = 0.5 * share / block
+        self._set_age(block)
 
     def _offset_weight(self) -> float:
         """Return the weight of a block in the offsets."""
-        block = self._patch.block
+        block = self._stream.block
         self._frames += block
-        longest = OFFSET_S / self._patch.period_s
+        longest = OFFSET_S / self._stream.period_s
         frames = min(self._frames + OFFSET_FRAMES, longest)
         if self._released is not None:
             since = self._released / CREEP
@@ -258,18 +258,19 @@ class SlowState:
         """Measure the drift of the stream between this block and an earlier one."""
         upper, lower = mean.shape
         means = self._means
-        means.append((mean.mean(axis=1), mean.mean(axis=0)))
+        means.append((np.add.reduce(mean, 1) / lower, np.add.reduce(mean, 0) / upper))
         if len(means) <= self._blocks_apart:
             return
         rows, columns = means.pop(0)
         by_rows, by_columns = means[-1][0] - rows, means[-1][1] - columns
         seconds = self._blocks_apart * self._block_s
-        of_noise = 2.0 * noise / self._patch.block
-        common = float(by_rows.mean())
+        of_noise = 2.0 * noise / self._stream.block
+        common = float(by_rows.sum()) / upper
         sums = 0.0
         for moved, count, other in ((by_rows, upper, lower), (by_columns, lower, upper)):
             if count > 1:
-                variance = float(((moved - moved.mean()) ** 2).sum()) / (count - 1) - of_noise / other
+                about = moved - common  # the mean of all readings is that of the rows and of the columns
+                variance = float(about @ about) / (count - 1) - of_noise / other
                 sums += variance * other / (upper + lower)
         found = sums / seconds
         most = max(1.0, WITHIN_S / self._block_s)
@@ -303,3 +304,8 @@ class SlowState:
         steps = max(math.floor(math.log(MOST_DRIFT * stated / drift) / math.log(FINER) + 1e-9), 0)
         level = MOST_DRIFT * stated / FINER**steps
         return used if level < used <= 1.1 * FINER * drift else level
+
+
+def _least(variances: tuple[float, ...], needed: float) -> int:
+    """Return the index of the smallest of the ascending ``variances`` that is at least ``needed``."""
+    return min(bisect.bisect_left(variances, 0.999 * needed), len(variances) - 1)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.detect.gain_drift import GainFilter
 from skinnode.solve.detect.held_touch import HeldTouch, creep_of
-from skinnode.solve.detect.slow_state import BLOCK, BLOCK_S, OFFSET_S, SlowState
+from skinnode.solve.detect.slow_state import BLOCK, BLOCK_S, OFFSET_S, SlowState, Stream
 from skinnode.solve.detect.touch_kernel import (
     COUNT,
     KEPT,
@@ -28,13 +29,9 @@ from skinnode.solve.detect.touch_kernel import (
     retest,
     see_frame,
 )
-from skinnode.solve.detect.touch_test import (
-    MOST_VECTORS,
-    PatchNoise,
-    TouchTest,
-    bounded_exp,
-    log_likelihood_ratio,
-)
+from skinnode.solve.detect.touch_odds import bounded_exp, log_likelihood_ratio, next_log_odds, octaves_for
+from skinnode.solve.detect.touch_statistic import TouchBasis
+from skinnode.solve.detect.touch_test import TouchTest, touch_tests
 
 ENOUGH: Final = 0.5
 """Minimum fraction of usable readings. With fewer, the detector makes no decision."""
@@ -44,12 +41,6 @@ Noise exceeds this limit in one of 1,700,000 frames of 300 readings."""
 ODD_WIRE: Final = 8.0
 """Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data are
 checked. Noise exceeds this limit in at most one of 25,000 frames."""
-TOUCHES_PER_S: Final = 1.0 / 60.0
-"""Prior rate of touches, 1/s, for the odds."""
-TOUCH_S: Final = 1.0
-"""Prior mean duration of a touch, s, for the odds."""
-PREPARED: Final = 6
-"""Number of tests computed in advance; enough for touches of up to ten minutes."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30
@@ -104,55 +95,71 @@ class TouchDetector:
         self._period_s, self._rate = period_s, false_alarms_per_hour
         self._gain_variance = None if gain_std is None else gain_std**2
         self._known = np.isfinite(baseline_ohm) & (baseline_ohm > 0.0)
+        sigma = np.hypot(self._own, self._rounding)
+        # rounded, so that patches whose noise differs only by rounding errors share their tests
+        ratios = np.where(self._known, sigma / np.median(sigma), 1.0).astype(np.float32).astype(np.float64)
+        self._ratios, self._shape_of_noise = ratios, ratios.tobytes()
+        self._basis = TouchBasis.of(layout, self._shape_of_noise)
+        size, gains = len(self._basis.responses_t), upper + lower + 1
         self._arrays = TouchArrays(
             ohm=np.full((upper, lower), np.nan),
             rest=np.where(self._known, baseline_ohm, 1.0),
             weight=np.zeros((upper, lower)),
             expected=np.zeros((upper, lower)),
             recent=np.zeros((KEPT, upper * lower)),
-            products=np.zeros((KEPT, MOST_VECTORS)),
+            responses=self._basis.responses_t,
+            ratios=self._basis.ratios,
+            features=np.zeros((KEPT, size + gains)),
+            shift=np.zeros(upper * lower),
+            shift_features=np.zeros(size + gains),
+            products=np.zeros((KEPT, size)),
             residual=np.zeros(upper),
             columns=np.zeros(lower),
             counts=np.zeros(lower),
             found=np.zeros(9),
         )
         self._factor = 1.0
-        self._prepare()
+        self._configure()
         self._arrays.ohm[:] = self._arrays.rest
         self._at, self._frames = 0, 1
         self._compute(1.0)
-        retest(self._arrays.table, self._test.rows, 0, 1)  # compile the kernels
+        retest(self._arrays.table, self._test.rows, self._slow.expected, 0, 1)  # compile the kernels
         self.reset()
 
-    def _prepare(self) -> None:
-        """Create the slow state and the test for the current noise."""
+    def _configure(self) -> None:
+        """Create the slow state and the tests for the current noise.
+
+        The ratios between the readings' noise are those at the start, so that the tests stay valid.
+        """
         sigma = np.hypot(self._factor * self._own, self._rounding)
         # noise of half a code or more makes the quantization errors of successive frames independent
         coded = self._rounding**2 / sigma**2
         undithered = (self._factor * self._own) ** 2 < 3.0 * self._rounding**2
-        # rounded, so that patches whose noise differs only by rounding errors share their tests
-        self._sigma = np.ascontiguousarray(sigma.astype(np.float32), np.float64)
-        self._weight = np.where(self._known, 1.0 / sigma, 0.0)
+        unit = float(np.median(sigma))
+        self._sigma = unit * self._ratios
+        self._weight = np.where(self._known, 1.0 / self._sigma, 0.0)
         self._least_noise = min(1.0, max(float(np.median(coded)), 1e-4))
-        block = max(BLOCK, round(BLOCK_S / self._period_s))
-        patch = PatchNoise(
+        self._tests = touch_tests(
             self._layout,
-            self._sigma.tobytes(),
+            self._shape_of_noise,
             round(float(np.where(undithered, coded, 0.0).mean()), 3),
             self._period_s,
             self._rate,
-            block,
         )
-        self._slow = SlowState(patch, self._gain_variance)
+        self._octaves = octaves_for(unit)
+        block = max(BLOCK, round(BLOCK_S / self._period_s))
+        gains = GainFilter.of(self._layout.shape, self._shape_of_noise)
+        self._slow = SlowState(
+            Stream(gains, unit, self._period_s, block, self._gain_variance), self._layout.shape
+        )
         self._use_test()
 
     def prepare(self) -> None:
-        """Compute the tests that a stream needs in its first minutes. Each test takes about 15 ms."""
-        for level in range(PREPARED):
-            self._slow.test_at(level)
+        """Compute all tests, so that none delays a frame of a stream. Patches of a layout share the tests."""
+        self._tests.prepare()
 
     def _use_test(self) -> None:
-        self._test: TouchTest = self._slow.test
+        self._test: TouchTest = self._tests.test(*self._slow.level)
 
     def reset(self) -> None:
         """Forget the stream; regard the patch as untouched and the baseline as fresh."""
@@ -179,7 +186,7 @@ class TouchDetector:
         self._factor = factor
         if noise is not None:
             self._own = noise.copy()
-        self._prepare()
+        self._configure()
         self._slow.carry_on(gains, expected * before / self._sigma)
         self._arrays.expected[:] = self._slow.expected
         self._noise, self._noise_frames, self._frames = 1.0, NOISE_START, 0
@@ -190,6 +197,11 @@ class TouchDetector:
     def test(self) -> TouchTest:
         """Current test."""
         return self._test
+
+    @property
+    def basis(self) -> TouchBasis:
+        """Features of the patch."""
+        return self._basis
 
     @property
     def gains(self) -> Float:
@@ -255,8 +267,11 @@ class TouchDetector:
         return TouchVerdict(self.touched, bounded_exp(self._log_odds), quiet)
 
     def _compute(self, variance: float) -> None:
-        test = self._test
-        see_frame(self._arrays.table, test.rows, test.shares, test.log_dets, variance, self._at, self._frames)
+        its = self._test.statistic
+        see_frame(
+            self._arrays.table, its.rows, its.shares, its.log_dets, self._octaves, variance, self._at,
+            self._frames,
+        )  # fmt: skip
 
     def _follow_noise(self, found: list[float]) -> None:
         """Average the noise variance. In touched frames, motion increases the measured variance."""
@@ -270,12 +285,12 @@ class TouchDetector:
 
     def _follow_rest(self, scaled: list[float], found: list[float]) -> bool:
         """Process a frame of an untouched patch; return whether it need not be solved."""
-        test, its = self._test, self._arrays
-        self._update_odds(found[RATIO])
-        if scaled[0] > test.onset[0] or scaled[1] > test.onset[1]:
+        limits, its = self._test.thresholds, self._arrays
+        self._log_odds = next_log_odds(self._log_odds, found[RATIO], self._period_s)
+        if scaled[0] > limits.onset[0] or scaled[1] > limits.onset[1]:
             self._begin_touch()
             return False
-        doubt = scaled[0] > test.doubt[0] or scaled[1] > test.doubt[1]
+        doubt = scaled[0] > limits.doubt[0] or scaled[1] > limits.doubt[1]
         if doubt:
             changed = self._slow.skip()
         else:
@@ -288,41 +303,32 @@ class TouchDetector:
 
     def _change_test(self) -> None:
         """Use the slow state's current expected changes and test."""
-        its, slow = self._arrays, self._slow
-        its.recent += (its.expected - slow.expected).ravel()
-        its.expected[:] = slow.expected
         self._use_test()
-        retest(its.table, self._test.rows, self._at, self._frames)
-
-    def _update_odds(self, log_ratio: float) -> None:
-        """Update the odds with a frame's log likelihood ratio: Bayes' rule for a two-state Markov chain."""
-        begins = min(TOUCHES_PER_S * self._period_s, 0.5)
-        ends = min(self._period_s / TOUCH_S, 0.5)
-        odds = bounded_exp(self._log_odds)
-        prior = (1.0 - ends) / ends
-        if odds < math.inf:
-            prior = (odds * (1.0 - ends) + begins) / (odds * ends + 1.0 - begins)
-        self._log_odds = log_ratio + math.log(prior)
+        retest(self._arrays.table, self._test.rows, self._slow.expected, self._at, self._frames)
 
     def _begin_touch(self) -> None:
         self.touched = True
         self._slow.discard()
         since_s = (self._clock - self._crept_at) * self._period_s
         creep = creep_of(self._crept_peak, since_s) if since_s < OFFSET_S else 0.0
-        self._touch = HeldTouch(self._test, self._arrays.recent[self._at].copy(), self._period_s, creep)
+        its, at = self._arrays, self._at
+        self._touch = HeldTouch(
+            self._test, its.recent[at].copy(), its.features[at].copy(), self._period_s, creep
+        )
 
     def _follow_touch(self, variance: float) -> None:
         """Process a frame of a touched patch."""
         its, slow = self._arrays, self._slow
         slow.skip()
-        later, ratio = slow.test, float(its.found[RATIO])
+        later, ratio = self._tests.test(*slow.level), float(its.found[RATIO])
         if later is not self._test:
-            ratio = log_likelihood_ratio(later, later.rows @ its.recent[self._at] / math.sqrt(variance))
-        self._update_odds(ratio)
+            z = later.rows @ its.features[self._at] / math.sqrt(variance)
+            ratio = log_likelihood_ratio(later.statistic, self._octaves, z)
+        self._log_odds = next_log_odds(self._log_odds, ratio, self._period_s)
         if self._frames < KEPT:
             return
-        touch = self._touch
-        ended = touch.follow(its.recent, its.recent[(self._at + 1) % KEPT], variance, later)
+        touch, first = self._touch, (self._at + 1) % KEPT
+        ended = touch.follow(its.features, first, its.recent[first], variance, later)
         if ended is False:
             return
         self.touched = False

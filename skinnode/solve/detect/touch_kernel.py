@@ -7,7 +7,7 @@ from typing import Annotated, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.compiled.array_table import ArrayTable, reader
+from skinnode.compiled.array_table import READONLY, ArrayTable, reader
 from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.cholesky import multiply_vector
@@ -33,8 +33,18 @@ class TouchArrays(ArrayTable):
     """Changes y expected without a touch, computed from the gains and offsets."""
     recent: Annotated[NDArray[np.float64], "4 m"]
     """Unexpected changes of the last frames."""
+    responses: Annotated[NDArray[np.float64], "R m", READONLY]
+    """Bᵀ: the part of the features that depends on the responses to loads."""
+    ratios: Annotated[NDArray[np.float64], "U K", READONLY]
+    """Noise of each reading divided by the median."""
+    features: Annotated[NDArray[np.float64], "4 F"]
+    """Features (Bᵀ y, Hᵀ y) of the last frames: R responses, U + K + 1 gains."""
+    shift: Annotated[NDArray[np.float64], "m"]
+    """Work array."""
+    shift_features: Annotated[NDArray[np.float64], "F"]
+    """Work array."""
     products: Annotated[NDArray[np.float64], "4 R"]
-    """z = G y of the last frames; only the first columns are used if the test has fewer rows."""
+    """z of the last frames."""
     residual: Annotated[NDArray[np.float64], "U"]
     """RMS of ln(R₀/R) over each upper wire's readings; inf if the wire has no readings."""
     columns: Annotated[NDArray[np.float64], "K"]
@@ -52,13 +62,13 @@ arrays_of = reader(TouchArrays)
 
 
 @njit_part
-def _norms(products: Float, size: int, at: int, frames: int, found: Float) -> None:
+def _norms(products: Float, at: int, frames: int, found: Float) -> None:
     """Write w ‖mean z‖² of the last w frames into ``found``, or 0 if there are fewer frames."""
     found[0], found[1], found[2] = 0.0, 0.0, 0.0
     now, last = products[at], products[(at + 3) % 4]
     third, fourth = products[(at + 2) % 4], products[(at + 1) % 4]
     one, three, four = 0.0, 0.0, 0.0
-    for i in range(size):
+    for i in range(now.size):
         three_sum = now[i] + last[i] + third[i]
         four_sum = three_sum + fourth[i]
         one += now[i] * now[i]
@@ -72,12 +82,32 @@ def _norms(products: Float, size: int, at: int, frames: int, found: Float) -> No
 
 
 @njit_part
-def _log_ratio(z: Float, size: int, shares: Float, log_dets: Float, variance: float) -> float:
-    """Return ln Σ exp ½ (Σ share z² / variance − log_det) over the octaves of depth."""
+def _features(responses: Float, ratios: Float, y: Float, features: Float) -> None:
+    """Write Bᵀ y, and the sums Hᵀ y over upper wires, lower wires and the patch, into ``features``."""
+    size = responses.shape[0]
+    upper, lower = ratios.shape
+    multiply_vector(responses, y, features[:size])
+    for j in range(size, features.size):
+        features[j] = 0.0
+    total = 0.0
+    for u in range(upper):
+        of_wire = 0.0
+        for k in range(lower):
+            value = y[u * lower + k] / ratios[u, k]
+            of_wire += value
+            features[size + upper + k] += value
+        features[size + u] = of_wire
+        total += of_wire
+    features[size + upper + lower] = total
+
+
+@njit_part
+def _log_ratio(z: Float, shares: Float, log_dets: Float, octaves: int, variance: float) -> float:
+    """Return the log of the mean of exp ½ (Σ share z² / variance − log_det) over the octaves."""
     most, total = -np.inf, 0.0
-    for j in range(log_dets.size):
+    for j in range(octaves):
         row, square = shares[j], 0.0
-        for i in range(size):
+        for i in range(z.size):
             square += row[i] * z[i] * z[i]
         term = 0.5 * (square / variance - log_dets[j])
         if term > most:
@@ -85,7 +115,7 @@ def _log_ratio(z: Float, size: int, shares: Float, log_dets: Float, variance: fl
             most = term
         else:
             total += np.exp(term - most)
-    found: float = most + np.log(total)
+    found: float = most + np.log(total / octaves)
     return found
 
 
@@ -95,6 +125,7 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
     rows: Float,
     shares: Float,
     log_dets: Float,
+    octaves: int,
     variance: float,
     at: int,
     frames: int,
@@ -103,9 +134,10 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
 
     Args:
         table: Table of :class:`TouchArrays`.
-        rows: (r, m) G of the test.
-        shares: (S, r) weights of the test's likelihood ratios.
+        rows: (R, F) matrix of the test.
+        shares: (S, R) weights of the test's likelihood ratios.
         log_dets: (S,) constants of the test's likelihood ratios.
+        octaves: Number of octaves of depth, at most S.
         variance: Noise variance of the stream, relative to the stated variance.
         at: Position of this frame in ``recent`` and ``products``.
         frames: Number of frames in ``recent``, including this one.
@@ -152,18 +184,39 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
             excess = max(excess, (columns[k] / variance - counts[k]) / np.sqrt(2.0 * counts[k]))
     found[LOWER] = excess
     found[MOTION] = motion / (6.0 * pairs) if pairs else -1.0
-    size = rows.shape[0]
-    multiply_vector(rows, y, its.products[at, :size])
-    _norms(its.products, size, at, frames, found)
-    found[RATIO] = _log_ratio(its.products[at], size, shares, log_dets, variance)
+    features, z = its.features[at], its.products[at]
+    _features(its.responses, its.ratios, y, features)
+    multiply_vector(rows, features, z)
+    _norms(its.products, at, frames, found)
+    found[RATIO] = _log_ratio(z, shares, log_dets, octaves, variance)
 
 
 @njit
-def retest(table: NDArray[np.int64], rows: Float, at: int, frames: int) -> None:
-    """Recompute the statistics of the last frames with another test; see :func:`see_frame`."""
+def retest(table: NDArray[np.int64], rows: Float, expected: Float, at: int, frames: int) -> None:
+    """Recompute the statistics of the last frames for other expected changes and another test.
+
+    Args:
+        table: Table of :class:`TouchArrays`.
+        rows: (R, F) matrix of the test; see :func:`see_frame`.
+        expected: (U, K) changes expected from now on.
+        at: Position of the last frame in ``recent`` and ``products``.
+        frames: Number of frames in ``recent``.
+    """
     its = arrays_of(table)
-    size = rows.shape[0]
+    before, shift, of_shift = its.expected, its.shift, its.shift_features
+    upper, lower = before.shape
+    for u in range(upper):
+        for k in range(lower):
+            shift[u * lower + k] = before[u, k] - expected[u, k]
+            before[u, k] = expected[u, k]
+    _features(its.responses, its.ratios, shift, of_shift)  # features are linear in the changes
+    for one in range(4):
+        recent, features = its.recent[one], its.features[one]
+        for i in range(shift.size):
+            recent[i] += shift[i]
+        for j in range(of_shift.size):
+            features[j] += of_shift[j]
     for back in range(frames):
         one = (at - back) % 4
-        multiply_vector(rows, its.recent[one], its.products[one, :size])
-    _norms(its.products, size, at, frames, its.found)
+        multiply_vector(rows, its.features[one], its.products[one])
+    _norms(its.products, at, frames, its.found)

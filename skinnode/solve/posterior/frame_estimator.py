@@ -208,16 +208,17 @@ class FrameEstimator:
         estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
         observation = self._observe(readings)
         self._hyper.set_least(observation)
-        if self._is_quiet(observation):
-            held = np.ones(len(self._wires), bool)
-            status = np.full(len(self._wires), Status.CONVERGED)
-        else:
-            try:
+        try:
+            if self._is_quiet(observation):
+                held = np.ones(len(self._wires), bool)
+                status = np.full(len(self._wires), Status.CONVERGED)
+            else:
                 status, held = self._solve(observation, readings)
-            except TimeoutError:
-                known = self._known
-                status, held = self._give_up(Status.DEADLINE)
-                self._known = known  # the trusted field is still a valid start for the next frame
+                observation = self._observe(readings)
+        except TimeoutError:
+            known = self._known
+            status, held = self._give_up(Status.DEADLINE)
+            self._known = known  # the trusted field is still a valid start for the next frame
             observation = self._observe(readings)
         return self._field(observation, status, held, start)
 

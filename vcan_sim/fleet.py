@@ -24,7 +24,7 @@ from vcan_sim.faulty_bus import FaultyBus, FaultyPort, Passed
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.fleet_faults import FleetFaults, Places
 from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene, schedule_of
-from vcan_sim.simulated_patch import SimulatedPatch, SkinMotion
+from vcan_sim.sensor import SimulatedPatch, SkinMotion
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 

@@ -33,7 +33,7 @@ from skinnode.process.garbage_collection import without_long_collections
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport.datagram import LOOPBACK, datagram
 from vcan_sim.default_scene import Scene
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
 """Polling interval of the sender, s. On a fully loaded bus, about two frames fall due in each interval.

@@ -27,7 +27,7 @@ from skinnode.protocol.command import SendMode, pack_command
 from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import PatchScene, SceneConfig, bind_scene, parse_scene
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 from vcan_sim.timed_bus import BitRates
 from vcan_sim.timed_interface import Segment, segment
 from vcan_sim.virtual_time import VirtualClock

@@ -38,7 +38,7 @@ from skinnode.protocol.device_time import TIME_STEP_US
 from skinnode.text.words import counted
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
-from vcan_sim.simulated_patch import REMEMBERED_READINGS
+from vcan_sim.sensor import REMEMBERED_READINGS
 
 WARM_UP: Final = 0.25
 """Warm-up time before the first memory measurement, as a fraction of the test duration."""

@@ -21,7 +21,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 ROAD: Final[tuple[dict[str, Any], ...]] = (
     {},

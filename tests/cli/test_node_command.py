@@ -390,7 +390,7 @@ def test_an_installed_package_registers_a_source(sources: Path, multicast_group:
 
 def test_the_simulator_is_registered_and_presses_the_patch() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][GROUP]
-    assert declared == {"simulated": "vcan_sim.simulated_patch:simulated"}
+    assert declared == {"simulated": "vcan_sim.sensor:simulated"}
     layout = PatchLayout.preset("staggered")
     source = load(declared["simulated"], "--source")(layout)
     now_ns = time.monotonic_ns()

@@ -16,7 +16,7 @@ from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.model.layout import PatchLayout
 from skinnode.text.printable import printable
 from vcan_sim.default_scene import Scene
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 from .healthy import NOISE, STEP, bus_of, node, quiet_ratio, scans_of, stats
 

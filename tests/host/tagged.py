@@ -7,11 +7,12 @@ import threading
 import numpy as np
 import pytest
 
+from skinnode.host.code_watch import Verdict
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
 from skinnode.protocol.scan import Scan
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 STEP = 1.0 / 65532
 """Of R/R0: one code of 16 bits."""
@@ -31,9 +32,11 @@ class Tags:
         self._looking = threading.Lock()
         solve = ScanSolver.solve
 
-        def look(solver: ScanSolver, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-            self._look(solver.decode(scan, stamp), solver.facts.baseline_ohm)
-            return solve(solver, scan, stamp)
+        def look(
+            solver: ScanSolver, scan: Scan, stamp: ScanStamp, verdict: Verdict
+        ) -> tuple[FieldFrame, int]:
+            self._look(solver.decode(verdict.admitted(scan), stamp), solver.facts.baseline_ohm)
+            return solve(solver, scan, stamp, verdict)
 
         monkeypatch.setattr(ScanSolver, "solve", look)
 

@@ -19,7 +19,7 @@ from skinnode.protocol.codes import MISSING, CodeScale, encode
 from skinnode.protocol.scan import Scan
 from skinnode.protocol.summary import SummaryFlag
 from vcan_sim.default_scene import Scene
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 SHAPE = (4, 12)
 NOISE = 3e-6

@@ -28,7 +28,7 @@ from tests.commands import Output, run_until_signal
 from vcan_sim.commands.run import _too_slow
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 from .conftest import SMALL, eventually
 

@@ -23,7 +23,7 @@ from skinnode.model.tolerances import ORDINARY
 from vcan_sim.default_scene import Scene
 from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import parse_scene, read_scene
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 from vcan_sim.skin.hysteresis_and_creep import STEP_S, THRESHOLDS
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch

@@ -14,7 +14,7 @@ from skinnode.host import Host
 from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.default_scene import Scene
 from vcan_sim.fleet import Fleet
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
 from vcan_sim.virtual_time import VirtualClock

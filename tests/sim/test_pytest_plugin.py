@@ -80,7 +80,7 @@ def test_a_bus_with_a_second_master(host, skin_faults, skin_clock):
 def test_a_minute_passes(host, skin_clock):
     begin_s = skin_clock.monotonic()
     skin_clock.sleep(20.0)
-    assert skin_clock.monotonic() == begin_s + 20.0
+    assert abs(skin_clock.monotonic() - begin_s - 20.0) < 1e-9
     assert host.stats().patches["palm"].solved > 390
 
 

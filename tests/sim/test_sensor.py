@@ -10,7 +10,7 @@ from skinnode.config import SimulationConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from vcan_sim.default_scene import Scene
-from vcan_sim.simulated_patch import SimulatedPatch
+from vcan_sim.sensor import SimulatedPatch
 
 LAYOUT = PatchLayout.preset("staggered")
 SCENE = Scene(LAYOUT, SimulationConfig(seed=5))

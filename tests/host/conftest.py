@@ -33,7 +33,7 @@ def nothing_left_running() -> Iterator[None]:
     yield
     left = [thread.name for thread in threading.enumerate() if thread not in threads]
     assert left == []
-    assert len(os.listdir("/proc/self/fd")) == len(descriptors)
+    assert len(os.listdir("/proc/self/fd")) <= len(descriptors)  # an earlier test's garbage may have gone
 
 
 @pytest.fixture(autouse=True)

@@ -34,7 +34,7 @@ def nothing_left_running() -> Iterator[None]:
     threads, descriptors = set(threading.enumerate()), os.listdir("/proc/self/fd")
     yield
     assert [thread.name for thread in threading.enumerate() if thread not in threads] == []
-    assert len(os.listdir("/proc/self/fd")) == len(descriptors)
+    assert len(os.listdir("/proc/self/fd")) <= len(descriptors)  # an earlier test's garbage may have gone
 
 
 def a_hand(patches: int = 2, bus: dict[str, object] | None = None, **tables: object) -> HandConfig:

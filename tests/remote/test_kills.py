@@ -33,6 +33,7 @@ def counts(program: Process) -> Any:
     return json.loads(program.tell("counts"))
 
 
+@pytest.mark.long
 def test_a_program_is_killed(start: Callable[..., Process], run: Callable[..., Process], port: int) -> None:
     daemon = start(period_ms=25).wait_until_up()
     victim = run("program.py", "hand", str(port)).wait_until_up()
@@ -48,6 +49,7 @@ def test_a_program_is_killed(start: Callable[..., Process], run: Callable[..., P
         assert json.loads(daemon.tell("stats"))["dropped"] == 0
 
 
+@pytest.mark.long
 def test_a_stopped_program_harms_nobody(
     start: Callable[..., Process], run: Callable[..., Process], port: int
 ) -> None:
@@ -70,6 +72,7 @@ def test_a_stopped_program_harms_nobody(
         eventually(lambda: counts(stopped)["away"] is None)
 
 
+@pytest.mark.long
 def test_a_program_may_start_before_the_daemon(
     start: Callable[..., Process], run: Callable[..., Process], port: int
 ) -> None:
@@ -104,6 +107,7 @@ def test_the_daemon_is_killed_and_returns(start: Callable[..., Process], port: i
         assert [each.lost for each in hand.stats().patches.values()] == [0, 0]
 
 
+@pytest.mark.long
 def test_the_router_is_killed_and_returns(
     start: Callable[..., Process], run: Callable[..., Process], port: int
 ) -> None:

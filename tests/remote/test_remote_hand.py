@@ -136,7 +136,7 @@ def test_a_wrong_name_lists_the_hands(start: Callable[..., Process], port: int) 
     ("name", "said"),
     [
         ("my hand", "name: got 'my hand', allowed: a hand that no other daemon publishes"),
-        ("my-hand", "'my hand'"),
+        pytest.param("my-hand", "'my hand'", marks=pytest.mark.long),
     ],
 )
 def test_a_hand_has_one_daemon(start: Callable[..., Process], name: str, said: str) -> None:
@@ -147,6 +147,7 @@ def test_a_hand_has_one_daemon(start: Callable[..., Process], name: str, said: s
     assert text.count("\n") == 1
 
 
+@pytest.mark.long
 def test_a_daemon_with_another_hand_file_is_refused(start: Callable[..., Process], port: int) -> None:
     first = start().wait_until_up()
     with sk.connect("hand", port=port) as hand:

@@ -59,8 +59,14 @@ def messages_in(path: Path | str) -> list[tuple[object, ...]]:
     return found
 
 
-@pytest.mark.parametrize("count", [1, 2])
-@pytest.mark.parametrize("kind", ["parquet", "mcap"])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [
+        ("mcap", 2),
+        *(pytest.param(*each, marks=pytest.mark.long) for each in (("mcap", 1), ("parquet", 2))),
+        ("parquet", 1),
+    ],
+)
 def test_the_file_is_the_one_that_convert_writes(
     recording: Path, tmp_path: Path, kind: str, count: int
 ) -> None:
@@ -107,6 +113,7 @@ def test_a_sweep_has_a_file_and_a_line_for_each_value(recording: Path, tmp_path:
         assert {row["method"] for row in table if not all(row["held"])} <= {method}
 
 
+@pytest.mark.long
 def test_a_calibration_of_one_patch_changes_its_forces_only(recording: Path, tmp_path: Path) -> None:
     key = "patches.p1.calibration.young_pa"
     results = resolve(recording, "-o", tmp_path, "--set", f"{key}=1e6,2e6", "--processes", 1)
@@ -138,6 +145,7 @@ def job_of(recording: Path, folder: Path, count: int = 2) -> Any:
     return job
 
 
+@pytest.mark.long
 def test_processes_that_are_killed_change_nothing(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,6 +197,7 @@ def test_a_unit_that_kills_every_process_is_named(
 COMMAND = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "resolve"]
 
 
+@pytest.mark.long
 def test_a_killed_command_continues_where_it_was(recording: Path, tmp_path: Path) -> None:
     wanted = tmp_path / "wanted.parquet"
     convert(recording, wanted)

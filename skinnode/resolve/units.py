@@ -38,8 +38,12 @@ class Unit:
 
     @cached_property
     def key(self) -> str:
-        """Hash of everything that determines the result, apart from the software."""
+        """Hash of everything that determines the result, including the software.
+
+        After an update, an interrupted run therefore does not continue with parts of the older version.
+        """
         content = [type(self).__name__, repr(self.recording), self.hand.model_dump_json()]
+        content.append(repr(sorted(_own_identity().items())))
         return hashlib.sha256("\n".join([*content, *self.details]).encode()).hexdigest()[:24]
 
     @property

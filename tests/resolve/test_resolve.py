@@ -23,7 +23,7 @@ from skinnode.errors import SkinError
 from skinnode.record import replay
 from skinnode.record.convert import convert
 from skinnode.record.open_recording import open_recording
-from skinnode.resolve import processes
+from skinnode.resolve import processes, units
 from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.plan import make_plan
 from skinnode.resolve.recording import recording_at
@@ -192,6 +192,18 @@ def test_a_unit_that_kills_every_process_is_named(
     named = pytest.raises(SkinError, match=r"run\.log: its process ended 3 times \(.*-9\); .*--processes")
     with work_folder(tmp_path) as folder, processes.Processes(1, folder) as workers, named:
         run([job_of(recording, tmp_path, 1)], workers, PartFiles(folder), lambda *_: None)
+
+
+def test_parts_of_another_version_are_not_used(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, job = PartFiles(tmp_path), job_of(recording, tmp_path)
+    every = len(job.units(parts))
+    with parts.new(job.captures[0].key) as part:
+        part.summary = None
+    assert len(job_of(recording, tmp_path).units(parts)) == every - 1
+    monkeypatch.setattr(units, "_identity", {"skinnode": "another version"})
+    assert len(job_of(recording, tmp_path).units(parts)) == every
 
 
 COMMAND = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "resolve"]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.messages.topics import HandTopics
+from skinnode.process.closing import Closing
 from skinnode.remote import discovery, keys
 from skinnode.remote.session import SessionOptions, open_daemon, require_zenoh
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import zenoh
 
 
-class Claim:
+class Claim(Closing):
     """Zenoh session of the only daemon of a hand, until :meth:`close`.
 
     Two daemons that start at the same moment may both be refused. Daemons that cannot reach each other, such
@@ -45,14 +45,6 @@ class Claim:
     def close(self) -> None:
         """Close the session."""
         self.session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _refuse_others(self, zid: str) -> None:
         base = HandTopics.of(self.hand).base

@@ -6,8 +6,7 @@ import contextlib
 import queue
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import SkinError
 from skinnode.host import Host
@@ -20,6 +19,7 @@ from skinnode.messages.topics import HandTopics
 from skinnode.messages.typestore import encode
 from skinnode.model.frames import FieldFrame
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.remote import keys
 from skinnode.remote.claim import Claim
 from skinnode.remote.command_server import CommandServer
@@ -49,7 +49,7 @@ class PublicationStats:
     """Number of exceptions, each of which cost a field or a report."""
 
 
-class Publication:
+class Publication(Closing):
     """Publishes a host from construction until :meth:`close`.
 
     Programs receive each field as ``skinnode_msgs/Field``. The ROS 2 standard messages are computed only for
@@ -92,14 +92,6 @@ class Publication:
         if self._commands is not None:
             self._commands.close()
         self._description.undeclare()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _describe(self, *, commands: bool) -> zenoh.Queryable[None]:
         """Answer queries for the description of the hand."""

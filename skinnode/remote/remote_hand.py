@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import SkinError
 from skinnode.host.callback import Callbacks, FieldCallback
@@ -21,6 +20,7 @@ from skinnode.messages.health_report import HealthReport
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
+from skinnode.process.closing import Closing
 from skinnode.remote import commands
 from skinnode.remote.accounts import PatchAccount, PatchCounts
 from skinnode.remote.daemon_watch import DaemonWatch
@@ -50,7 +50,7 @@ class RemoteStats:
     """Number of messages that could not be decoded, and of other exceptions."""
 
 
-class RemoteHand:
+class RemoteHand(Closing):
     """Hand that a daemon (``skinnode host --publish``) publishes; :func:`skinnode.connect` creates it.
 
     If the daemon ends or the connection fails, subscriptions wait, :meth:`health` reports every patch as lost
@@ -237,14 +237,6 @@ class RemoteHand:
         self._publisher.end()
         self._events.end()
         self._callbacks.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _command(self, request: dict[str, object], deadline_s: float) -> None:
         patch = str(request["patch"])

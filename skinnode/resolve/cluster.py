@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from skinnode.errors import ConfigError, Shown, SkinError
+from skinnode.process.closing import Closing
 from skinnode.resolve import identity as identity_module
 from skinnode.resolve.identity import difference, identity
 from skinnode.resolve.processes import one_line_of
@@ -31,7 +31,7 @@ def require_dask() -> None:
         raise ConfigError("--scheduler", Shown("no package distributed"), allowed)
 
 
-class Cluster:
+class Cluster(Closing):
     """Workers of a Dask cluster. All workers must have this version of skinnode and see the same files.
 
     Args:
@@ -143,14 +143,6 @@ class Cluster:
             self._client.cancel(list(self._futures))
         with suppress(Exception):
             self._client.close(timeout=2)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _run_here(unit: Unit, folder: str, expected: dict[str, str]) -> str:

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from skinnode.errors import SkinError
 from skinnode.process.child_processes import starting_children
+from skinnode.process.closing import Closing
 from skinnode.resolve.identity import identity
 from skinnode.resolve.units import Unit, run_unit
 from skinnode.resolve.workers import MOST_DEATHS
@@ -34,7 +34,7 @@ class _Child:
     unit: Unit | None = None
 
 
-class Processes:
+class Processes(Closing):
     """Workers in child processes, which are started when they are needed.
 
     Args:
@@ -84,14 +84,6 @@ class Processes:
             child.process.join(_END_S)
             child.connection.close()
         self._children = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _hand_out(self) -> None:
         while self._waiting:

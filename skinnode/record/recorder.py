@@ -249,7 +249,7 @@ class Recorder:
                     self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> bool:
-        """Queue an entry with a number of frames; return whether the entry was queued or is not wanted."""
+        """Queue an entry of ``frames`` frames; return True if it was queued or is not needed."""
         if self._failure is not None or self._queue.qsize() >= CAPACITY:
             self._lost += frames
             return False
@@ -299,7 +299,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Write and flush everything so far."""
+        """Write and flush all data recorded so far."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)

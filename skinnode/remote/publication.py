@@ -42,7 +42,7 @@ class PublicationStats:
     """Counters of a publication."""
 
     published: dict[str, int]
-    """Number of fields sent, by patch name; the sequence number of the newest field."""
+    """Number of fields sent, by patch name; equals the sequence number of the newest field."""
     dropped: int
     """Number of fields not sent because this process was too slow."""
     failed: int
@@ -50,13 +50,13 @@ class PublicationStats:
 
 
 class Publication:
-    """Publishes a host from construction until :meth:`close`.
+    """Publishes a host's data from construction until :meth:`close`.
 
     Programs receive each field as ``skinnode_msgs/Field``. The ROS 2 standard messages are computed only for
-    the topics to which a program subscribes.
+    topics that have a subscriber.
 
     Args:
-        host: Running host, which is never delayed. The publication ends when the host closes.
+        host: Running host, which the publication never delays. The publication ends when the host closes.
         claim: Claim on the hand; the caller closes it.
         commands: Whether programs may tare patches and reset nodes.
 
@@ -102,7 +102,7 @@ class Publication:
         self.close()
 
     def _describe(self, *, commands: bool) -> zenoh.Queryable[None]:
-        """Answer queries for the description of the hand."""
+        """Answer queries for the hand's description."""
         hand = self._host.hand
         layouts = {name: self._host.layout(name) for name in self._patches}
         key, data = keys.description_key(hand.name), Description(hand, layouts, boot_id(), commands).encode()
@@ -113,7 +113,7 @@ class Publication:
 
         return self._session.declare_queryable(key, answer)
 
-    # --- the thread of the fields
+    # --- the field thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "publishing a field")
@@ -126,7 +126,7 @@ class Publication:
             field = self._fields.take(_POLL_S)
         except queue.Empty:
             return True
-        except SkinError:  # the error that stopped the host, which the host reports
+        except SkinError:  # the error that stopped the host; the host reports it
             return False
         if field is None:
             return False

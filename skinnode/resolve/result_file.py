@@ -28,7 +28,7 @@ def write_result(
 ) -> None:
     """Write the fields of all patches to a new file, in the order of a replay.
 
-    The file appears under its name when it is complete.
+    The file appears under its final name only when it is complete.
 
     Args:
         recording: The recording.

@@ -1,4 +1,4 @@
-"""Child processes of :mod:`skinnode.bench.remote`: a program that uses the hand, a pinger and an echo."""
+"""Child processes of :mod:`skinnode.bench.remote`: a client, a ping sender and an echo server."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ def run(  # noqa: PLR0913 - options of a command
         seed: Seed of all streams.
         pairs: Number of streams with two faults.
         hours: Total length of the streams in which false alarms are counted, patch-hours.
-        only: Substrings of the names of the sections and rows to run; default: all.
+        only: Substrings of section and row names; only matching rows are run. Default: all rows.
         settings: Layouts and noise levels; default: all.
         jobs: Number of processes that solve streams in parallel; the results do not depend on this number.
         progress: Function that receives a line of text after every 20 streams.

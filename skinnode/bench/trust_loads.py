@@ -157,7 +157,7 @@ class Plate:
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change of the plate's depth along x and along y, 1/m."""
+    """Relative change in the plate's depth along x and along y, 1/m."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:

@@ -13,10 +13,10 @@ data                            message
 classic CAN frame               ``can_msgs/Frame``, as in ros_canopen and ros2_socketcan
 CAN FD frame                    ``ros2_socketcan_msgs/FdFrame``
 displacement field              ``sensor_msgs/PointCloud2`` and ``skinnode_msgs/FieldInfo``
-field without loss              ``skinnode_msgs/Field``
+field, lossless                 ``skinnode_msgs/Field``
 contact                         ``geometry_msgs/WrenchStamped`` and ``skinnode_msgs/Contacts``
 health of patches and buses     ``diagnostic_msgs/DiagnosticArray``
-health without loss             ``skinnode_msgs/HealthReport``
+health, lossless                ``skinnode_msgs/HealthReport``
 event                           ``rcl_interfaces/Log``
 poses of patches and links      ``tf2_msgs/TFMessage``
 line of a recording's journal   ``skinnode_msgs/JournalLine``

@@ -37,12 +37,12 @@ _log = logging.getLogger(__name__)
 FLUSH_S: Final = 0.25
 """Interval between flushes to the kernel, s.
 
-A crash of this process costs the recording at most its last 0.25 s.
+If this process crashes, at most the last 0.25 s of the recording are lost.
 """
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s. A power failure costs the recording about its last second. Each fsync call
-blocks the writer thread for about 10 ms."""
+"""Interval between fsync calls, s. In a power failure, about the last second of the recording is lost. Each
+fsync call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
 """Maximum number of queued batches of frames, enough for several seconds on four fully loaded buses."""
@@ -71,7 +71,7 @@ class RecorderStats:
 
 
 def name_in(folder: Path, hand: HandConfig, kind: RecordingFormat, now: datetime.datetime) -> Path:
-    """Return a path in ``folder`` for a recording, composed of the hand's name, the date and the time."""
+    """Return a path in ``folder`` for a recording, consisting of the hand's name, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 

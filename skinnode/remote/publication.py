@@ -46,7 +46,7 @@ class PublicationStats:
     dropped: int
     """Number of fields not sent because this process was too slow."""
     failed: int
-    """Number of exceptions, each of which cost a field or a report."""
+    """Number of exceptions, each of which caused the loss of a field or a report."""
 
 
 class Publication:

@@ -2,7 +2,7 @@
 
 A part file is written under a temporary name and renamed when it is complete and on disk. A file with the
 name of a part is therefore always complete, even after a power failure, and the files in a work folder show
-which units are finished. They are pickles, written and read by the same version of skinnode.
+which units are finished. The files are pickles, written and read by the same version of skinnode.
 """
 
 from __future__ import annotations

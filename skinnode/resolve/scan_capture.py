@@ -68,7 +68,7 @@ class CaptureSummary:
 
 
 class Capture:
-    """Scans of some of a recording's buses. They can be iterated only once.
+    """Scans from some buses of a recording. They can be iterated only once.
 
     Args:
         recording: The recording.

@@ -38,7 +38,7 @@ Variant = tuple[Setting, ...]
 
 
 def variants(options: Sequence[str]) -> list[Variant]:
-    """Return all combinations of the values of options.
+    """Return all combinations of option values.
 
     Args:
         options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. A value is a TOML value; a value that is not

@@ -57,7 +57,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class CaptureScans(Unit):
-    """Unit that assembles the scans of some buses. Its part has the summary; each patch has another part.
+    """Unit that assembles the scans of some buses. Its part has the summary; each patch has its own part.
 
     Attributes:
         buses: Names of the buses.

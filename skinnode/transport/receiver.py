@@ -25,7 +25,7 @@ CAPACITY_FRAMES: Final = 16384
 frames/s)."""
 
 _POLL_S: Final = 0.02
-"""Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
+"""Maximum time (s) to wait for a frame before the thread checks whether it must stop."""
 _POLL_NS: Final = round(_POLL_S * 1e9)
 
 GATHER_NS: Final = 1_500_000

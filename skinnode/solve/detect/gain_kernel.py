@@ -29,9 +29,9 @@ class GainArrays(ArrayTable):
     by_patch: Annotated[NDArray[np.float64], "V V", READONLY]
     """Covariance of v if the gain of the patch has a variance of 1."""
     of_uppers: Annotated[NDArray[np.float64], "V V", READONLY]
-    """Weights of the covariance of v in the variance of an upper wire's gain."""
+    """Weights by which the covariance of v contributes to the variance of an upper wire's gain."""
     of_lowers: Annotated[NDArray[np.float64], "V V", READONLY]
-    """Weights of the covariance of v in the variance of a lower wire's gain."""
+    """Weights by which the covariance of v contributes to the variance of a lower wire's gain."""
     of_mean: Annotated[NDArray[np.float64], "V", READONLY]
     """Coefficients of the mean change in all readings."""
     mean: Annotated[NDArray[np.float64], "m"]

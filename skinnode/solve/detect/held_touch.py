@@ -1,12 +1,12 @@
 """Ongoing touch: decides when the touch has ended.
 
-While the patch is touched, the gains drift, so the expected readings at rest become increasingly uncertain. A
+While the patch is touched, the gains drift, so the expected readings at rest become less and less certain. A
 touch therefore ends in one of four ways:
 
-- the readings agree with the rest readings that were expected when the touch began;
-- the readings have changed towards rest, and agree with it within the drift since the onset;
+- the readings agree with the values that were expected at rest when the touch began;
+- the readings have changed towards rest, and agree with the rest values within the drift since the onset;
 - a small fraction of the touch remains and stays constant, because the rubber creeps;
-- the readings have agreed with rest, within the drift, for half an hour.
+- the readings have agreed with the rest values, within the drift, for half an hour.
 
 A held press meets none of these conditions for ten minutes, however slight it is.
 """
@@ -56,7 +56,7 @@ class HeldTouch:
     def follow(
         self, features: Float, at: int, oldest: Float, variance: float, later: TouchTest
     ) -> bool | None:
-        """Process a frame; return True if the touch has ended, None if creep remains after it, else False.
+        """Process a frame; return True if the touch ended, None if it ended and creep remains, else False.
 
         Args:
             features: (4, F) features of the last four frames.

@@ -269,7 +269,7 @@ class SlowState:
         sums = 0.0
         for moved, count, other in ((by_rows, upper, lower), (by_columns, lower, upper)):
             if count > 1:
-                about = moved - common  # rows and columns have the same mean: that of all readings
+                about = moved - common  # the mean over rows, or over columns, is that of all readings
                 variance = float(about @ about) / (count - 1) - of_noise / other
                 sums += variance * other / (upper + lower)
         found = sums / seconds

@@ -32,7 +32,7 @@ class TouchArrays(ArrayTable):
     expected: Annotated[NDArray[np.float64], "U K"]
     """Changes y expected without a touch, computed from the gains and offsets."""
     recent: Annotated[NDArray[np.float64], "4 m"]
-    """Unexpected changes in the last frames."""
+    """Unexpected changes in the readings of the last frames."""
     responses: Annotated[NDArray[np.float64], "R m", READONLY]
     """Bᵀ: the part of the features that depends on the responses to loads."""
     ratios: Annotated[NDArray[np.float64], "U K", READONLY]

@@ -3,8 +3,8 @@
 Let y = ln(R₀/R)/σ be the changes in the readings from rest, in units of their noise, after subtraction of the
 estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ includes the noise and the errors in the
 gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
-readings' response to loads at a depth that noise almost hides. A touched frame therefore has y ~ N(0, V₀ + B
-Bᵀ), and its likelihood ratio depends on
+readings' response to loads at a depth that noise almost hides. A touched frame therefore has
+y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
     T = yᵀ (V₀⁻¹ − (V₀ + B Bᵀ)⁻¹) y
 
@@ -51,7 +51,7 @@ WIRE_VARIANCES: Final = (*(2.0 ** np.arange(-9.0, 2.0)).tolist(), 1e6)
 """Variances of a wire's gain about the mean of its layer, in units of a reading's noise variance. The
 smallest has little effect on the test; with the largest, the gains are unknown."""
 PATCH_VARIANCES: Final = (*(2.0 ** np.arange(-12.0, 0.0)).tolist(), 1e6)
-"""Variances of the gain of the patch, like :data:`WIRE_VARIANCES`."""
+"""Variances of the patch's gain, in the same units as :data:`WIRE_VARIANCES`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Statistic:
 
 
 class TouchBasis:
-    """Features of a kind of patch, and its statistics.
+    """Features and statistics for patches of one kind.
 
     Args:
         layout: The patch.

@@ -119,7 +119,7 @@ class DiscPrior:
             members: Wires whose equations are used.
             untouched2: s² of the loads on untouched skin, pitch².
             uniform2: s² of equal loads over the whole patch, pitch².
-            spread: Whether to compute :attr:`spread` as well.
+            spread: Whether to compute :attr:`spread` too.
 
         Returns:
             The variances; None if the loads are not local.

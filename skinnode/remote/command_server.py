@@ -42,7 +42,7 @@ class CommandServer:
         self._queryable = session.declare_queryable(self._key, self._accept)
 
     def close(self) -> None:
-        """Accept no more commands, and wait for the command in progress."""
+        """Stop accepting commands, and wait for the command in progress to finish."""
         self._queryable.undeclare()
         self._waiting.put(None)
         self._thread.join()
@@ -60,7 +60,7 @@ class CommandServer:
             with query:
                 try:
                     self._execute(b"" if query.payload is None else query.payload.to_bytes())
-                except Exception as error:  # the program gets the error; the daemon continues
+                except Exception as error:  # the program receives the error; the daemon continues
                     query.reply_err(_error(error))
                 else:
                     query.reply(self._key, b"")

@@ -23,7 +23,7 @@ from skinnode.errors import ConfigError
 from skinnode.messages.typestore import typestore
 
 _NODE: Final = "skinnode"
-"""Name of the ROS 2 node that the daemon represents."""
+"""Name of the ROS 2 node as which the daemon appears."""
 _QOS: Final = "::,:,:,:,,"
 """rmw_zenoh's encoding of its default QoS: reliable, volatile, keep last 42 (``qos.cpp``)."""
 _HIGHEST_DOMAIN: Final = 232
@@ -88,7 +88,7 @@ def publisher_token(zid: str, entity: int, topic: str, message: str) -> str:
 
 
 def hand_token(hand: str, zid: str) -> str:
-    """Return the liveliness token by which a daemon claims a hand."""
+    """Return the liveliness token with which a daemon claims a hand."""
     return f"skinnode/{domain()}/hands/{_quoted(hand)}/{zid}"
 
 

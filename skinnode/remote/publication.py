@@ -84,7 +84,7 @@ class Publication:
         return PublicationStats(dict(self._published), self._fields.dropped, self._defects.count)
 
     def close(self) -> None:
-        """Stop publishing, and wait for the threads."""
+        """Stop publishing, and wait for the threads to end."""
         self._over.set()
         self._thread.join()
         self._status.close()

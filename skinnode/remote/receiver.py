@@ -84,7 +84,7 @@ class Receiver:
         ]
 
     def close(self) -> None:
-        """Stop receiving, and wait for the thread."""
+        """Stop receiving, and wait for the thread to end."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._inbox.put(End())

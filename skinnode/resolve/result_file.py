@@ -33,7 +33,7 @@ def write_result(
     Args:
         recording: The recording.
         hand: The hand with the options of the variant.
-        solved: Keys of the parts with the fields of the patches.
+        solved: Keys of the parts that contain the patches' fields.
         target: The file; its suffix is one of :data:`FORMATS`.
         parts: Part files.
 

@@ -85,7 +85,7 @@ class CaptureScans(Unit):
             part.summary = capture.summary()
 
     def key_of_patch(self, patch: str) -> str:
-        """Return the key of the part with the scans of a patch."""
+        """Return the key of the part that contains a patch's scans."""
         return f"{self.key}-{[each.name for each in self.hand.patches].index(patch)}"
 
 

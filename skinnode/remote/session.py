@@ -74,7 +74,7 @@ class SessionOptions:
 
     @property
     def exposed(self) -> str | None:
-        """Endpoint that other machines can reach without TLS; None if there is none."""
+        """Non-local endpoint without TLS; None if there is none."""
         for option, endpoint in (("--router", self.router), ("--listen", self.listen)):
             encrypted = endpoint is None or endpoint.startswith(("tls/", "quic/"))
             if endpoint is not None and not encrypted and not _is_local(host_of(option, endpoint)):
@@ -121,8 +121,7 @@ def require_protected(options: SessionOptions, *, commands: bool) -> None:
         commands: Whether the daemon accepts commands.
 
     Raises:
-        ConfigError: if the daemon accepts commands over an endpoint that other machines can reach without
-            TLS.
+        ConfigError: if the daemon accepts commands over a non-local endpoint without TLS.
     """
     if commands and options.exposed is not None:
         allowed = "only with endpoints of this machine, or tls/… with --zenoh-config"

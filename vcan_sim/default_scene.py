@@ -34,7 +34,7 @@ _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Press, slide and lift of a sphere. ``heading`` is the unit vector of the slide."""
+    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is the slide's unit vector."""
 
     radius_m: float
     depth_m: float

@@ -1,4 +1,4 @@
-"""Measures the touch detector's hit and false-alarm rates, with loads unlike those of its model.
+"""Measures the touch detector's hit and false-alarm rates for loads that differ from those in its model.
 
 The readings come from :class:`skinnode.bench.truth.Skin`, an independent forward model with closed-form
 displacements. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, like a finger pad. A *small sphere*
@@ -45,7 +45,7 @@ FAMILIES: Final = (
 )
 """Load families as (kind, depth in layer heights)."""
 REQUIRED: Final = (("blunt sphere", 0.02), ("dent", 0.05))
-"""Loads of which a fraction :data:`FOUND` must be found within three frames."""
+"""Loads for which a fraction :data:`FOUND` of the presses must be found within three frames."""
 FOUND: Final = 0.95
 WITHIN: Final = 3
 REACHABLE: Final = 3.6
@@ -54,11 +54,11 @@ REACHABLE: Final = 3.6
 TAPS: Final = (1, 2, 3)
 """Durations of taps, in scans."""
 RAMPS_S: Final = (1.0, 3.0, 10.0, 30.0, 100.0)
-"""Times in which a slow press reaches its full depth, s."""
+"""Times that slow presses take to reach full depth, s."""
 HOLD_S: Final = 600.0
 SHIFT_H: Final = 4.0
-"""Time from one tare to the next in the count of false alarms, h. Over 100 hours, a steady drift of 1 % an
-hour would reduce some gains to zero."""
+"""Time between tares while false alarms are counted, h. Without tares, a steady drift of 1 % per hour would
+reduce some gains to zero within 100 hours."""
 DETECTOR_US: Final = 20.0
 STREAM: Final = (50.0, 99.0, 99.9, 100.0)
 """Percentiles of the CPU time per frame in a stream of 4,000 frames with eight touches."""
@@ -69,8 +69,8 @@ def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
 
     Args:
         seed: Seed of all random numbers.
-        presses: Number of presses for each load, layout and drift.
-        hours: Hours of one patch at rest in which false alarms are counted at the default rate.
+        presses: Number of presses per load, layout and drift.
+        hours: Time for which one patch at rest is observed to count false alarms at the default rate, h.
     """
     figures: dict[str, Any] = {
         "benchmark": "accuracy detection",
@@ -91,7 +91,7 @@ def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
 def _patch(seed: int, preset: str, height: float, noise: float, drift: str, **options: float) -> Patch:
     layout = PatchLayout.preset(preset, pitch_m=PITCH_M, height_m=height * PITCH_M)
     patch = Patch(layout, noise, drift, np.random.default_rng([seed, round(1e3 * height)]), **options)
-    patch.rest(1500)  # two minutes, in which the detector learns the drift
+    patch.rest(1500)  # two minutes, during which the detector learns the drift
     return patch
 
 
@@ -159,7 +159,7 @@ def taps(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def slow(seed: int) -> list[dict[str, Any]]:
-    """Return how deep slow presses are when found, whether held presses stay touched, and when creep ends."""
+    """Test at what depth slow presses are found, whether held presses stay touched, and when creep ends."""
     rows: list[dict[str, Any]] = []
     for depth in (0.02, 0.05, 0.1):
         for seconds in RAMPS_S:
@@ -212,7 +212,7 @@ def slow(seed: int) -> list[dict[str, Any]]:
 
 
 def alarms(seed: int, hours: float) -> list[dict[str, Any]]:
-    """Count the detector's false alarms at rest, at the default rate and at a rate that reveals errors."""
+    """Count false alarms at rest, at the default rate and at a rate that is high enough to reveal errors."""
     rows = []
     wanted = [(NOISE, drift, FALSE_ALARMS_PER_HOUR, hours) for drift in DRIFTS]
     wanted += [
@@ -241,7 +241,7 @@ def alarms(seed: int, hours: float) -> list[dict[str, Any]]:
 
 
 def roc(seed: int, presses: int) -> list[dict[str, Any]]:
-    """Return the fraction of presses found in one and in three frames, for each rate of false alarms."""
+    """Return the fraction of presses found within one and within three frames, for each false-alarm rate."""
     from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
     patch = _patch(seed, "staggered", 0.5, NOISE, "steady")
@@ -308,7 +308,7 @@ def times(seed: int) -> dict[str, Any]:
         start_ns = time.thread_time_ns()
         patch.detector.see(frame)
         one_by_one.append(1e-3 * (time.thread_time_ns() - start_ns))
-    # other programs slow some rounds; the fastest round shows the time of the detector itself
+    # other programs slow down some rounds; the fastest round shows the time of the detector itself
     return {
         "stream_us": dict(zip(STREAM, np.percentile(one_by_one, STREAM).tolist(), strict=True)),
         "median_us": min(median for median, _ in rounds),

@@ -1,9 +1,9 @@
 """Measures the posterior's accuracy for loads that its prior does not expect, with and without discs.
 
-Each scene is one frame, solved from rest. A coordinate counts as moved if it moves by at least a tenth of
-the largest displacement of its scene; all others are at rest. "Error over claim" is the RMS error divided by
-the RMS standard deviation behind the 95 % interval (:attr:`skinnode.FieldFrame.core_std_m`). Deviations are
-errors divided by :attr:`skinnode.FieldFrame.displacement_std_m`, which also allows for rare large errors.
+Each scene is one frame, solved from rest. A coordinate counts as moved if it moves by at least a tenth of the
+largest displacement of its scene; all others are at rest. "Error over claim" is the RMS error divided by the
+RMS standard deviation behind the 95 % interval (:attr:`skinnode.FieldFrame.core_std_m`). Deviations are
+errors divided by :attr:`skinnode.FieldFrame.displacement_std_m`, which also accounts for rare large errors.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ WRONG_MOST: Final = 0.01
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one scene. Sums and counts over coordinates are pairs: moved coordinates, those at rest."""
+    """Result of one scene. Sums and counts are pairs: for moved coordinates, and for coordinates at rest."""
 
     family: str
     layout: tuple[str, float]
@@ -50,7 +50,7 @@ class Sample:
     square: tuple[float, float]
     """Sum of squared errors, m²."""
     claim: tuple[float, float]
-    """Sum of claimed variances, m²."""
+    """Sum of reported variances, m²."""
     inside: tuple[int, int]
     """Number of coordinates within the 95 % interval."""
     count: tuple[int, int]
@@ -58,11 +58,13 @@ class Sample:
     worst: float
     """Largest error, in standard deviations."""
     contacts: tuple[int, int]
-    """Number of contacts found, and number of loads."""
+    """Numbers of contacts found and of loads."""
     force: tuple[float, float]
-    """Error of the total normal force, and its standard deviation, N; NaN if unknown or without contacts."""
+    """Error of the total normal force, and its standard deviation, N; NaN if unknown or if there are no
+    contacts."""
     centroid: tuple[float, float]
-    """Distance from the only contact to the only load, and its standard deviation, m; otherwise NaN."""
+    """Distance from contact to load, and its standard deviation, m; NaN unless there is exactly one of
+    each."""
     seconds: float
     """Processor time, s."""
 
@@ -151,11 +153,12 @@ def run(scenes: int, echo: Callable[[str], object] = lambda _: None) -> dict[str
     """Solve random scenes of each family with each prior.
 
     Args:
-        scenes: Number of scenes of each family for each layout and noise.
+        scenes: Number of scenes per family, layout and noise level.
         echo: Function that prints a progress line.
 
     Returns:
-        One row per prior, layout, noise and family, and one per prior and family over all layouts and noises.
+        One row per prior, layout, noise level and family, and one row per prior and family over all layouts
+        and noise levels.
     """
     rows, families = [], []
     for prior in PRIORS:

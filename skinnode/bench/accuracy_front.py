@@ -52,9 +52,9 @@ class Scene:
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), resistances during the press, ohm; the sample at rest is excluded."""
+    """(T, U, K) resistances during the press, ohm, excluding the sample at rest."""
     truth_m: Float
-    """(U, N, 3), true displacement at the last sample, metres."""
+    """(U, N, 3) true displacement at the last sample, metres."""
 
     def thinned(self, samples: int) -> Float:
         """Return ``samples`` evenly spaced samples of the press, ending with the last."""
@@ -62,7 +62,7 @@ class Scene:
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the norm of the error of a displacement (U, N, 3), divided by the norm of the true one."""
+        """Return the norm of a displacement's error (U, N, 3), relative to that of the true displacement."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 

@@ -70,7 +70,7 @@ class Patch:
     def rest_long(self, frames: int) -> tuple[int, int]:
         """Pass many frames of the untouched patch to the detector.
 
-        The frames are generated in blocks, which takes a tenth of the time of :meth:`see`.
+        The frames are generated in blocks, which takes a tenth of the time that :meth:`see` takes.
 
         Args:
             frames: Number of frames.
@@ -89,7 +89,7 @@ class Patch:
         return onsets, untouched
 
     def rest_block(self, frames: int) -> Float:
-        """Return the next resistances (frames, U, K) of the untouched patch, ohm."""
+        """Return the untouched patch's resistances (frames, U, K) in the next frames, ohm."""
         errors = []
         for gains, rates in ((self._upper, self._rates[0]), (self._lower, self._rates[1])):
             steps = np.zeros((frames, *gains.shape))

@@ -76,7 +76,7 @@ def draw(
 
 
 def _pair(layout: PatchLayout, rng: np.random.Generator, depth: float | None) -> tuple[Load, Load]:
-    """Return two spheres whose distance is within :data:`APART`."""
+    """Return two spheres whose distance is in the range :data:`APART`."""
     while True:
         first, second = (trust_loads.draw("sphere", layout, rng, depth) for _ in range(2))
         gap = np.subtract(second.center_m, first.center_m)
@@ -91,7 +91,7 @@ def _grid(thickness_m: float, cells: tuple[int, int], size_m: float) -> Grid:
 
 
 def _on_layer(kind: str, layout: PatchLayout, loads: tuple[Load, ...], rng: np.random.Generator) -> Scene:
-    """Press rigid bodies at the places and to the depths of ``loads`` into a bonded layer."""
+    """Press rigid bodies into a bonded layer, at the positions and to the depths of ``loads``."""
     pitch = layout.pitch_m
     thickness = float(rng.choice(THICKNESSES)) * layout.height_m
     _, low, high = trust_loads.surface_m(layout)

@@ -171,7 +171,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """Solve all experiments with one step control, and return their mean cost and accuracy."""
+    """Run all experiments with the given step-size controller; return their mean cost and accuracy."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()

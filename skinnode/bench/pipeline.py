@@ -46,7 +46,7 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""Scenes as (whether CAN FD is used, whether patches are touched, offset between SYNCs in ms)."""
+"""Scenes as triples: True for CAN FD, True for touched patches, and the offset between SYNCs in ms."""
 DEADLINE_US: Final = 1000
 """Deadline for solving a scan, µs. For comparison, an exact inverse takes 200 µs, and its verification by the
 posterior 13 ms."""

@@ -161,7 +161,7 @@ def _solved(host: Host) -> int:
 
 
 def frame_us() -> dict[str, float]:
-    """Time the exchange of a frame between two endpoints that both receive it.
+    """Measure the time to exchange a frame between two endpoints that both receive it.
 
     Returns:
         Time per frame, µs: ``python_can`` with python-can, ``port`` with

@@ -1,8 +1,8 @@
-"""Measures the way of fields to a second process over Zenoh, beside a bare Zenoh ping of the same payload.
+"""Measures the latency of fields sent to a second process over Zenoh, and of bare Zenoh pings of equal size.
 
 The host is that of :mod:`skinnode.bench.pipeline`: sixteen patches on four CAN FD buses, whose frames a child
 process replays. A second process connects to the hand. At the same time, two more processes exchange messages
-of the size of a field by Zenoh alone; they contain no code of skinnode between sending and receiving.
+of the size of a field over Zenoh alone, without any skinnode code between sending and receiving.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ BUSES: Final = 4
 ROUND_S: Final = 60.0
 """Duration of a round, s; the replayed frames of a round are held in memory."""
 TIMES_A_PING: Final = 3.0
-"""Maximum ratio of the p99 of fields to the p99 of pings."""
+"""Maximum ratio of the fields' p99 latency to the pings' p99 latency."""
 PORT: Final = 17647
-"""First port of the benchmark, so that it does not meet daemons of the machine."""
+"""First port of the benchmark, chosen to avoid other daemons on the machine."""
 PING_PORT: Final = PORT + 16
 _SETTLE_S: Final = 1.0
 
@@ -48,15 +48,15 @@ Row = dict[str, Any]
 
 
 def run(seconds: float, *, publish_only: bool, report: Callable[[Row], None]) -> dict[str, Any]:
-    """Measure rounds of up to a minute.
+    """Measure in rounds of up to a minute.
 
     Args:
         seconds: Total duration, s.
         publish_only: Whether to measure the host without a second process and without pings.
-        report: Function that receives the figures of each round.
+        report: Function called with the figures of each round.
 
     Returns:
-        The rounds, all rounds together and the requirements.
+        The rounds, their totals and the requirements.
     """
     rounds = max(1, round(seconds / ROUND_S))
     rows: list[Row] = []
@@ -76,7 +76,7 @@ def _measure(hand: HandConfig, generator: Generator, *, connected: bool) -> Row:
         stack.enter_context(without_long_collections())
         stack.enter_context(responsive_threads())
         host = stack.enter_context(Host.from_config(hand, open_port=DatagramPort))
-        # a hand file permits at most the whole bus, and programs read the hand as a hand file
+        # programs parse the hand like a hand file, which permits a bus load of at most 1
         buses = tuple(bus.model_copy(update={"max_load": 1.0}) for bus in hand.buses)
         host.hand = hand.model_copy(update={"buses": buses})
         claim = stack.enter_context(Claim(hand, SessionOptions(port=PORT)))
@@ -92,7 +92,7 @@ def _measure(hand: HandConfig, generator: Generator, *, connected: bool) -> Row:
         begin_s, cpu_s = time.monotonic(), time.process_time()
         generator.wait()
         wall_s, cpu_s = time.monotonic() - begin_s, time.process_time() - cpu_s
-        time.sleep(_SETTLE_S)  # for the last fields
+        time.sleep(_SETTLE_S)  # wait for the last fields
         followed = _answer(program)
         pings = _answer(pinger)
         _answer(echo)
@@ -117,7 +117,7 @@ def _unaccounted(published: dict[str, int], followed: Row) -> Row:
 
     Returns:
         ``received``, ``lost`` (gaps found by the program) and ``unaccounted``: fields that the daemon has
-        sent since the program's first field of the patch, and that the program neither received nor counted
+        sent since the program's first field of the patch, but that the program neither received nor counted
         as lost.
     """
     counts = followed.get("counts", {})
@@ -154,7 +154,7 @@ def _total(rows: list[Row]) -> Row:
 
 
 def spread(rows: list[Row], key: str) -> dict[str, float]:
-    """Return p50, p99 and the maximum of times that rows contain."""
+    """Return p50, p99 and the maximum of the times that the rows contain under ``key``."""
     values = np.concatenate([row[key] for row in rows])
     if not len(values):
         return {}
@@ -176,7 +176,7 @@ def _must(total: Row) -> list[Row]:
 
 
 def _payload_bytes(hand: HandConfig) -> int:
-    """Return the size of an encoded field of the first patch, bytes."""
+    """Return the size of the first patch's encoded field, bytes."""
     from skinnode.solve.tracker import Tracker
 
     layout = hand.patches[0].layout.build()
@@ -190,7 +190,7 @@ def _payload_bytes(hand: HandConfig) -> int:
 
 @contextlib.contextmanager
 def _child(program: Callable[..., None], *arguments: Any) -> Iterator[Connection]:
-    """Run a function in another process, with a pipe to it; the process ends when the pipe is closed."""
+    """Run a function in another process, connected by a pipe; the process ends when the pipe is closed."""
     context = multiprocessing.get_context("spawn")
     pipe, theirs = context.Pipe()
     process = context.Process(target=until_closed, args=(program, theirs, *arguments), daemon=True)
@@ -214,7 +214,7 @@ def _answer(pipe: Connection | None) -> Row:
 
 
 def _received(pipe: Connection) -> Any:
-    """Return the next message of a child process. Raises SkinError if the process has ended."""
+    """Return the next message from a child process. Raises SkinError if the process has ended."""
     try:
         return pipe.recv()
     except (EOFError, OSError):

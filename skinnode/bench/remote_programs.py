@@ -1,4 +1,4 @@
-"""Child processes of :mod:`skinnode.bench.remote`: a program that uses the hand, and a ping and its echo."""
+"""Child processes of :mod:`skinnode.bench.remote`: a client, a ping sender and an echo server."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def until_closed(program: Callable[..., None], *arguments: Any) -> None:
 
 
 def follow(pipe: Connection, hand: str, port: int) -> None:
-    """Connect to a hand and receive its fields until the parent sends a word; send the times and counters."""
+    """Receive a hand's fields until the parent sends a message; then send the times and counters."""
     from skinnode.remote import connect
 
     times_ms: list[float] = []
@@ -61,7 +61,7 @@ def follow(pipe: Connection, hand: str, port: int) -> None:
 
 
 def ping(pipe: Connection, port: int, payload_bytes: int) -> None:
-    """Send a message every 10 ms and wait for its echo, until the parent sends a word; send the times."""
+    """Send a ping every 10 ms and await its echo until the parent sends a message; then send the times."""
     import zenoh
 
     arrived: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -85,7 +85,7 @@ def ping(pipe: Connection, port: int, payload_bytes: int) -> None:
 
 
 def pong(pipe: Connection, port: int) -> None:
-    """Echo messages until the parent sends a word."""
+    """Echo messages until the parent sends a message."""
     import zenoh
 
     with _session({"listen/endpoints": [f"tcp/127.0.0.1:{port}"]}) as session, without_long_collections():

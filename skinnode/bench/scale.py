@@ -63,8 +63,8 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
     Returns:
         The processor and the library versions (``machine``); the lists of rows ``area``, ``contact`` and
         ``changed``; and the result of :func:`physics`. In ``changed``, the patches send only changed chunks.
-        A row contains the numbers of ``patches`` and ``touched`` patches, whether only changed chunks are
-        sent (``changed_only``), the CPU times per patch and scan in ms (``nodes_ms``, ``bus_ms``,
+        A row contains the numbers of ``patches`` and ``touched`` patches, a flag that is true if only changed
+        chunks are sent (``changed_only``), the CPU times per patch and scan in ms (``nodes_ms``, ``bus_ms``,
         ``host_ms``), the numbers of measured ``scans`` and solved ``fields``, the ratio of virtual to real
         time (``faster``), and the resident memory of the process (``memory_mb``).
     """

@@ -1,6 +1,6 @@
 """Implements ``skinnode bench trust``: tests whether trusted values are right and faults are detected.
 
-For each stream, data pass through the modules in this order::
+The data of each stream pass through the modules in this order::
 
     trust_loads, trust_faults -> trust_signal -> trust_solver -> trust_score -> trust_report
 
@@ -38,7 +38,7 @@ from skinnode.text.json_values import plain
 PAIRS: Final = 500
 """Default number of streams with two randomly chosen faults."""
 PARTS: Final = ("table", "speed", "road")
-"""Names of the additional parts: earlier failures, speed against error, and fault injection over a bus."""
+"""Names of the additional parts: earlier failures, speed versus error, and fault injection over a bus."""
 SHORT: Final[dict[str, Any]] = {
     "pairs": 20,
     "hours": 0.0,
@@ -199,7 +199,7 @@ def run(  # noqa: PLR0913 - options of a command
         seed: Seed of all streams.
         pairs: Number of streams with two faults.
         hours: Total length of the streams in which false alarms are counted, patch-hours.
-        only: Substrings of the names of the sections and rows to run; default: all.
+        only: Substrings of section and row names; only matching rows are run. Default: all rows.
         settings: Layouts and noise levels; default: all.
         jobs: Number of processes that solve streams in parallel; the results do not depend on this number.
         progress: Function that receives a line of text after every 20 streams.

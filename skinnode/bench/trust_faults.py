@@ -126,7 +126,7 @@ def _leave_one(signal: Signal) -> None:
 
 
 def _freeze(start: Callable[[Signal], int], *, counted: bool = True) -> InPlace:
-    """Return a function that repeats a scan's codes; ``counted``: whether the patch counts conversions."""
+    """Return a function that repeats a scan's codes; ``counted`` is True if the patch counts conversions."""
 
     def sent(signal: Signal) -> None:
         t = start(signal)

@@ -31,7 +31,7 @@ LINES: Final = 16
 WAVES: Final = 1500
 """Number of wave numbers at which Hankel transforms are sampled."""
 WAVE_MAX: Final = 60.0
-"""Maximum product of wave number and contact radius. Higher wave numbers contribute only 1e-4 of Hertz's
+"""Maximum product of wave number and contact radius. Higher wave numbers contribute only 1e-4 of the Hertz
 pressure."""
 
 _UNKNOWN: Final = np.full(3, np.nan)
@@ -157,7 +157,7 @@ class Plate:
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change of the plate's depth along x and along y, 1/m."""
+    """Relative change in the plate's depth along x and along y, 1/m."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
@@ -166,13 +166,13 @@ class Plate:
         return np.asarray(depth[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def force_n(self, share: float) -> Float:
-        """Return NaN, because the force also depends on the skin outside the patch."""
+        """Return NaN, because the force also depends on skin outside the patch."""
         return _UNKNOWN
 
 
 @dataclass(frozen=True)
 class Bonded:
-    """A press with Hertz's pressure on an incompressible rubber layer bonded to a rigid base.
+    """A press with Hertz pressure on an incompressible rubber layer bonded to a rigid base.
 
     The displacement is computed with Hankel transforms. For wave number k and layer height h, let x = k h.
     The layer's transformed deflection is that of a half-space multiplied by L(x) = (sinh 2x − 2x)/(cosh 2x +

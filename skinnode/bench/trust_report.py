@@ -76,7 +76,7 @@ def _must(what: str, got: float, asked: float, *, least: bool = False) -> dict[s
 
 
 def _false_namings(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Compare the false-alarm rate with its target; the note of the row gives the confidence bounds."""
+    """Compare the false-alarm rate with its target; the row's note gives the confidence bounds."""
     hours, events = _sum(rows, "frames") / RATE_HZ / 3600.0, round(_sum(rows, "false_names"))
     low, high = rate_bounds(events, hours)
     verdict = _must("false alarms per patch-hour", events / hours, FALSE_PER_HOUR)

@@ -29,12 +29,12 @@ LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
 NOISES: Final = (1e-5, 1e-4, 1e-3)
 SCALE: Final = CodeScale(16)
 RATE_HZ: Final = 100.0
-"""Scan rate at which numbers of scans are converted to hours, Hz."""
+"""Scan rate used to convert numbers of scans to hours, Hz."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Number of scans in each phase of a stream; by default, about 5 s at 12.5 scans/s in all."""
+    """Number of scans in each phase of a stream; by default, about 5 s in total at 12.5 scans/s."""
 
     rest: int = 12
     press: int = 8
@@ -72,15 +72,15 @@ class Signal:
 
     rng: np.random.Generator
     rest_ohm: Float
-    """(U, K), baseline resistances stored in the node, ohm."""
+    """(U, K) baseline resistances stored in the node, ohm."""
     ohm: Float
-    """(T, U, K), readings in ohm."""
+    """(T, U, K) readings, ohm."""
     bad: NDArray[np.bool_]
-    """(T, U, K), whether a fault changed the reading."""
+    """(T, U, K) bool: True where a fault changed the reading."""
     pressed: slice
     """Range of the scans in which the load is at full depth."""
     phase: NDArray[np.int64]
-    """(T,), conversion phase sent in each summary: 1, 2, 3, 1, …; always 0 if the patch does not count
+    """(T,) conversion phase sent in each summary: 1, 2, 3, 1, …; always 0 if the patch does not count
     conversions."""
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint32))
 
@@ -93,29 +93,29 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class CodeStream:
-    """The scans of a patch as received by the host, with the true displacements and forces."""
+    """A patch's scans as received by the host, with the true displacements and forces."""
 
     layout: PatchLayout
     baseline_ohm: Float
-    """(U, K), baseline resistances stored in the node, ohm."""
+    """(U, K) baseline resistances stored in the node, ohm."""
     stated_noise: float
     """Relative noise stated in the hand file."""
     ordinary: bool
     """Whether the hand file states ordinary manufacturing tolerances for the patch."""
     codes: Codes
-    """(T, U, K), received codes; MISSING if the chunk was lost."""
+    """(T, U, K) received codes; MISSING if the chunk was lost."""
     truth_m: Float
-    """(T, U, N, 3), true displacement, metres."""
+    """(T, U, N, 3) true displacement, metres."""
     force_n: Float
-    """(T, 3), true force on the skin, newtons; NaN if unknown."""
+    """(T, 3) true force on the skin, newtons; NaN if unknown."""
     bad: NDArray[np.bool_]
-    """(T, U, K), whether a fault changed the reading."""
+    """(T, U, K) bool: True where a fault changed the reading."""
     touched: NDArray[np.bool_]
-    """(T,), whether the load is at full depth."""
+    """(T,) bool: True while the load is at full depth."""
     untouched: NDArray[np.bool_]
-    """(T,), whether the patch is at rest."""
+    """(T,) bool: True while the patch is at rest."""
     phase: NDArray[np.int64]
-    """(T,), conversion phase received in each summary; always 0 if the patch does not count conversions."""
+    """(T,) conversion phase received in each summary; always 0 if the patch does not count conversions."""
     scored_from: int = 0
     """Index of the first scored scan."""
 

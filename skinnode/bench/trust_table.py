@@ -35,8 +35,8 @@ NAMED: Final = 0.95
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
 """Timeline of a short stream, which ends while the load is held."""
 BLUNT_M: Final = 100e-6
-"""Maximum error of a trusted, precise field that was computed from half of the readings, metres: 5 % of the
-layer height."""
+"""Maximum error of a trusted, precise field computed from half of the readings, metres: 5 % of the layer
+height."""
 STEADY: Final = 0.95
 """Minimum fraction of fields with the right number of contacts, and of contacts with the right force."""
 

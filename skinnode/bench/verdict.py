@@ -50,10 +50,10 @@ class Solved:
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3), reported standard deviation, metres. For path methods, the value is the error estimate
+    """(F, U, N, 3) reported standard deviation, metres. For path methods, the value is the error estimate
     divided by 5."""
     converged: NDArray[np.bool_]
-    """(F, U), whether a wire is CONVERGED and, if trust was assessed, trusted."""
+    """(F, U) bool: True for a wire that is CONVERGED and, if trust was assessed, trusted."""
 
     def equals(self, other: Solved) -> bool:
         """Return whether both results are bitwise equal."""

@@ -127,8 +127,8 @@ TPDO1_MAPPING: Final = 0x1A00
 TPDO2_MAPPING: Final = 0x1A01
 """Index of the mapping record of TPDO2. The records of consecutive TPDOs have consecutive indices."""
 MAX_PDOS: Final = 512
-"""Maximum number of RPDOs, and also of TPDOs. It equals the number of indices in a range such as 0x1400 to
-0x15FF."""
+"""Maximum number of RPDOs; the same limit applies separately to TPDOs. It equals the number of indices in a
+range such as 0x1400 to 0x15FF."""
 PDO_MAPPING_OFFSET: Final = 0x200
 """Offset from the index of a PDO's communication record to that of its mapping record."""
 PDO_INVALID: Final = 1 << 31

@@ -1,8 +1,8 @@
 """Finds the nodes on a bus by SDO, heartbeat and LSS.
 
-The search requests the device type (0x1000) from every node-ID and records heartbeats meanwhile. Nodes
-without a node-ID are found by LSS, which switches their LSS mode. The search changes nothing else on any
-node.
+The search requests the device type (0x1000) from every node-ID and records the heartbeats received during the
+search. Nodes without a node-ID are found by LSS, which switches their LSS mode. The search changes nothing
+else on any node.
 """
 
 from __future__ import annotations

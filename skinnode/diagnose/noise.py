@@ -43,7 +43,7 @@ _TOUCHED: Final = 2
 _STEP: Final = 20.0
 """Minimum height of a jump, relative to the stated noise."""
 _STAYS: Final = 0.3
-"""Maximum difference between the height of a jump and the change of the median, as a fraction of the
+"""Maximum difference between the height of a jump and the change in the median, as a fraction of the
 height."""
 _STILL: Final = 0.1
 """Maximum standard deviation of a signal after its jump has been removed, as a fraction of the height."""

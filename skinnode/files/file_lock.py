@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum number of attempts to lock a file. An attempt fails if the previous owner removes the file
-meanwhile."""
+"""Maximum number of attempts to lock a file. An attempt fails if the previous owner removes the file during
+the attempt."""
 
 
 class FileInUse(BlockingIOError):

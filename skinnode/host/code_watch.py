@@ -39,14 +39,14 @@ class Verdict:
     """Result of checking the codes of a scan."""
 
     distrust: str = ""
-    """Human-readable reason not to trust the field of the scan; empty if there is none."""
+    """Human-readable reason for distrusting the scan's field; empty if there is none."""
     faults: tuple[DataFault, ...] = ()
     """Faults found: frozen patch, frozen wires and crossings, open and shorted wires."""
     left_out: NDArray[np.bool_] | None = None
     """(U, K) mask of the crossings to leave out of the solve; None if there are none."""
 
     def admitted(self, scan: Scan) -> Scan:
-        """Return the scan with the crossings that are left out of the solve marked as missing."""
+        """Return the scan with the crossings in :attr:`left_out` marked as missing."""
         if self.left_out is None:
             return scan
         codes = np.where(self.left_out, np.uint32(MISSING), scan.codes)
@@ -118,7 +118,7 @@ class CodeWatch:
 
         Args:
             scan: Scan to check.
-            number: Scan number to record in new faults; by default, that of the scan.
+            number: Scan number to record in new faults; default: the number of ``scan``.
         """
         parts = self._parts
         if parts is None:

@@ -73,7 +73,7 @@ patch to count as noisy.
 LONGER: Final = 4
 """Minimum length of a run that counts as frozen, as a multiple of the running converter's longest run."""
 PROOF_NS: Final = 1_000_000_000
-"""Time (ns) for which a change of a code or of the phase proves that the converter is running."""
+"""Time (ns) for which a change in a code or in the phase proves that the converter is running."""
 PHASES_REPEATED: Final = 3
 """Number of scans without a new conversion after which a patch is reported as frozen. The same number of
 missed scans makes a patch stale. Even the field of the first such scan is not trusted.

@@ -27,12 +27,12 @@ _GOOD: Final = frozenset(
     )
 )
 _NOTE: Final = frozenset(("booting", "boot_ups", "foreign", "noisy", "drifting", "left out"))
-"""Types of events that are no faults, and of those that may become faults."""
+"""Types of events that are not faults, or that may become faults."""
 
 
 @dataclass(frozen=True, slots=True)
 class HealthEvent:
-    """Change in the health of a patch, a bus or the host, or onset or release of a touch."""
+    """Change in the health of a patch, a bus or the host, or the onset or release of a touch."""
 
     t_ns: int
     """Monotonic time of the change, ns. For a touch, this is the time of the scan that showed the change."""
@@ -50,7 +50,7 @@ class HealthEvent:
 
     @property
     def severity(self) -> Severity:
-        """How serious the change is: ``good``, ``note`` or ``bad``."""
+        """Severity of the change: ``good``, ``note`` or ``bad``."""
         if self.what in _GOOD:
             return "good"
         return "note" if self.what in _NOTE else "bad"
@@ -123,7 +123,7 @@ class Events:
         self._offer(event)
 
     def end(self) -> None:
-        """End all subscriptions, because the host closes."""
+        """End all subscriptions when the host closes."""
         self._ended = True
         self._offer(End())
 

@@ -257,7 +257,7 @@ class NodeMonitor:
         beats, period_ns = self._beats, heartbeat_s * 1e9
         if len(beats) < BEATS:
             return False
-        first_ns, last_ns = beats[0], beats[-1]  # never fewer, even if the mainline appends one meanwhile
+        first_ns, last_ns = beats[0], beats[-1]  # never fewer, even if the mainline appends one concurrently
         if now_ns - last_ns > HEARTBEATS_MISSED * period_ns:
             return False
         return last_ns - first_ns < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns

@@ -37,7 +37,7 @@ NOISY: Final = 25.0
 5 times the median noise amplitude.
 """
 DRIFT: Final = 1e-3
-"""Minimum change of a drifting wire, as a fraction of R0. A light touch changes a crossing ten times as much.
+"""Minimum change in a drifting wire, as a fraction of R0. A light touch changes a crossing ten times as much.
 """
 UNEVEN: Final = 0.05
 """Maximum deviation of the crossings of a drifting wire from their median, as a fraction of the drift."""

@@ -1,7 +1,7 @@
-"""Count each crossing's repeated codes, and measure how far its neighbours' codes move meanwhile.
+"""Count each crossing's repeated codes, and measure how far its neighbours' codes move during the run.
 
 The *run* of a crossing is the number of successive scans that have repeated its code. Its *lead* is the
-change of its neighbours' codes during the run. There are two leads: one along the upper wire and one along
+change in its neighbours' codes during the run. There are two leads: one along the upper wire and one along
 the lower wire. If both neighbours on the wire have changed in the same direction, the lead is the smaller of
 the two changes; otherwise, it is 0. For a crossing at the end of a wire, the two nearest crossings on the
 wire serve as neighbours.
@@ -44,7 +44,7 @@ MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range
 - ``MEASURED``: number of codes that are measurements.
 - ``CHANGED``: number of changed codes.
 - ``RETURNED``: number of codes that have changed back to their value before the last change.
-- ``LARGEST``: largest change of a code.
+- ``LARGEST``: largest change in a code.
 - ``RESERVED``: number of crossings whose newest code is reserved.
 - ``LEAST``: smallest code that is a measurement.
 - ``RELEASED``: number of crossings reported as frozen whose code has changed.

@@ -72,7 +72,7 @@ class ScanSolver:
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp, verdict: Verdict = FAULTLESS) -> tuple[FieldFrame, int]:
-        """Solve a scan, allowing for converter noise and for the quantization error of the codes.
+        """Solve a scan, accounting for converter noise and for the quantization error of the codes.
 
         Args:
             scan: The scan.

@@ -20,13 +20,13 @@ _TIME = struct.Struct("<iI")
 _CLASSIC = struct.Struct("<I???B")
 _FD = struct.Struct("<I??B")
 _AFTER_TIME = 12
-"""Offset of ``frame_id`` in a message that begins with a header, bytes: four bytes of encapsulation and eight
-bytes of time precede it."""
+"""Offset of ``frame_id`` in a message that begins with a header, bytes. Four encapsulation bytes and eight
+time bytes precede it."""
 _CLASSIC_BYTES = 8
 
 
 def frame_message(frame: Frame, frame_id: str) -> tuple[str, Any]:
-    """Return the message name for a CAN frame, and the message.
+    """Return the name and the content of the message for a CAN frame.
 
     Args:
         frame: The frame; ``t_ns`` is a time since 1970.
@@ -84,7 +84,7 @@ def frame_of(data: bytes, name: str) -> Frame:
         name: Name of the message.
 
     Raises:
-        ValueError: The data are not a CAN frame.
+        ValueError: The data do not contain a CAN frame.
     """
     message = decode(data, name)
     stamp, payload = message.header.stamp, message.data.tobytes()

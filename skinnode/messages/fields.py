@@ -23,7 +23,7 @@ CLOUD_FIELDS: Final = (
 )
 """Fields of a point: displaced position (m) in the patch frame, displacement (m) and its standard deviation
 (m; infinite where unknown), force on the skin (N; NaN if no forces were computed), and the fraction of the
-displacement that is determined by the data. The points are ordered by upper wire and, within a wire, by
+displacement that the data determine. The points are ordered by upper wire and, within a wire, by
 electrode."""
 
 _FLOAT32: Final = 7
@@ -61,7 +61,7 @@ def point_cloud(field: FieldFrame, rest_m: Float, t_ns: int) -> Any:
 
 
 def field_info(field: FieldFrame, t_ns: int) -> Any:
-    """Return a field's data that a point cloud cannot contain, as ``skinnode_msgs/FieldInfo``.
+    """Return the data of a field that a point cloud cannot hold, as ``skinnode_msgs/FieldInfo``.
 
     Args:
         field: The field, with a stamp.

@@ -1,4 +1,4 @@
-"""Converts displacement fields to ``skinnode_msgs/Field``, which contains everything, and back."""
+"""Converts displacement fields to ``skinnode_msgs/Field`` and back, without loss."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _NOTHING = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SendStamp:
-    """Number and time of a field that is sent to other processes."""
+    """Sequence number and times of a field that is sent to other processes."""
 
     started_ns: int
-    """Time since 1970 at which the publisher started, ns; identifies its run."""
+    """Time since 1970 at which the publisher started, ns; identifies the publisher's run."""
     sequence: int
-    """Number of the field of its patch in this run, from 1."""
+    """Sequence number of the field among its patch's fields in this run, from 1."""
     sent_ns: int
     """Time since 1970 at which the field was sent, ns."""
     wall_minus_mono_ns: int
-    """Time since 1970 minus the monotonic clock of the host, ns."""
+    """Time since 1970 minus the host's monotonic clock, ns."""
 
 
 def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:
@@ -39,7 +39,7 @@ def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:
 
     Args:
         field: The field, with a stamp.
-        sent: Number and time of the field.
+        sent: Sequence number and times of the field.
     """
     stamp = field.stamp
     assert stamp is not None
@@ -65,10 +65,10 @@ def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:
 
 
 def decode_field(data: bytes) -> tuple[FieldFrame, SendStamp]:
-    """Decode a field from ``skinnode_msgs/Field``. The times of its stamp are those of its host.
+    """Decode a field from ``skinnode_msgs/Field``. The times in its stamp refer to the host's clock.
 
     Raises:
-        ValueError: The data are not such a message.
+        ValueError: The data are not a valid ``skinnode_msgs/Field``.
     """
     message = decode(data, FIELD)
     info, shape = message.info, (message.upper_wires, message.electrodes, 3)

@@ -1,4 +1,4 @@
-"""Converts the health of a hand to ``skinnode_msgs/HealthReport``, which loses nothing, and back."""
+"""Converts a hand's health to ``skinnode_msgs/HealthReport`` and back, without loss."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from skinnode.transport.bus_state import BusState
 
 @dataclass(frozen=True, slots=True)
 class HealthReport:
-    """Health of a hand at one instant, and the counters of its publisher."""
+    """Health of a hand at one instant, and its publisher's counters."""
 
     started_ns: int
-    """Time since 1970 at which the publisher started, ns; identifies its run."""
+    """Time since 1970 at which the publisher started, ns; identifies the publisher's run."""
     patches: Mapping[str, PatchHealth]
     buses: Mapping[str, BusHealth]
     published: Mapping[str, int]
     """Number of fields sent so far in this run, by patch name."""
     dropped: int
-    """Number of fields that the publisher could not send in time, all patches."""
+    """Number of fields of all patches that the publisher could not send in time."""
 
 
 def encode_report(report: HealthReport, t_ns: int) -> bytes:
@@ -48,7 +48,7 @@ def decode_report(data: bytes) -> HealthReport:
     """Decode a report.
 
     Raises:
-        ValueError: The data are not such a message.
+        ValueError: The data are not a valid ``skinnode_msgs/HealthReport``.
     """
     message = decode(data, HEALTH_REPORT)
     try:

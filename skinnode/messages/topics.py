@@ -1,6 +1,6 @@
 """Names the ROS 2 topics of a hand and the coordinate frames of its patches.
 
-A ROS 2 name contains only letters, digits and underscores. Any other character of a name in the hand file
+A ROS 2 name contains only letters, digits and underscores. Any other character in a name from the hand file
 becomes an underscore.
 """
 
@@ -50,7 +50,7 @@ class HandTopics:
 
     @staticmethod
     def base_of(hand: str) -> str:
-        """Return the namespace of the hand called ``hand``."""
+        """Return the namespace of the hand named ``hand``."""
         return f"/{_tokens([hand])[hand]}"
 
     @classmethod

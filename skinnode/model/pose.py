@@ -13,7 +13,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Maximum deviation of the length of a quaternion from 1, to allow for rounded input."""
+"""Maximum deviation of a quaternion's length from 1; accounts for rounded input."""
 
 
 @dataclass(frozen=True, slots=True)

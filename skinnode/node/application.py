@@ -29,7 +29,7 @@ class Application(Protocol):
         ...
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state to OPERATIONAL or to another state."""
+        """Handle an NMT state change to OPERATIONAL or to another state."""
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:

@@ -155,7 +155,7 @@ class CanopenDevice:
             self._tpdos.on_remote(can_id, t_ns)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Handle a change of the CAN controller's state.
+        """Handle a change in the CAN controller's state.
 
         At bus-off, the error behaviour (0x1029) takes effect immediately. The emergency message follows when
         the bus has recovered.

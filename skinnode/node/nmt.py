@@ -16,7 +16,7 @@ class NmtSlave:
     Args:
         store: object dictionary.
         rejected: counters of rejected frames.
-        entered: callback for a change of state, given the new state, the previous state and the time in ns.
+        entered: callback for a state change; receives the new state, the previous state and the time in ns.
     """
 
     def __init__(

@@ -116,7 +116,7 @@ class Sync:
         self._start()
 
     def enter(self, *, communicates: bool) -> None:
-        """Handle a change of the NMT state.
+        """Handle a change in the NMT state.
 
         SYNCs are produced and consumed in PRE-OPERATIONAL and OPERATIONAL. When the node enters one of these
         states from any other state, the SYNC counter restarts at 1.

@@ -1,12 +1,13 @@
 """Records the traffic of a running host, and replays recordings to compute the same fields.
 
-``recorder`` queues what the host's threads pass on and writes it on a thread of its own: to ``log_files`` (a
-candump log or a BLF file, and a journal next to it) or to ``mcap_file`` (one MCAP file, which ``follow`` also
-gives the fields, contacts, health and events). The ``journal`` contains everything other than the frames that
-affected how the host decoded them. ``sources`` opens recordings, and logs of other masters with a hand file;
-``mcap_chunks`` and ``mcap_reader`` read MCAP files that may be damaged. ``replay`` decodes the frames with
-the host's own code. ``convert`` converts recordings: with ``copy_frames`` from frames to frames, and with
-``field_table``, ``parquet_file`` and ``npz_file`` to tables of fields.
+``recorder`` queues the data from the host's threads and writes them in a separate thread: to ``log_files`` (a
+candump log or a BLF file, and a journal next to it) or to ``mcap_file`` (one MCAP file, to which ``follow``
+adds the fields, contacts, health and events). The ``journal`` contains everything except the frames
+themselves that affected how the host decoded the frames. ``open_recording`` opens recordings, and logs of
+other masters with a hand file; ``mcap_chunks`` and ``mcap_reader`` read MCAP files that may be damaged.
+``replay`` decodes the frames with the host's own code. ``convert`` converts recordings to other formats: it
+repairs MCAP files with ``copy_mcap``, and writes tables of fields with ``field_rows``, ``parquet_file`` and
+``npz_file``.
 """
 
 from skinnode.record.follow import followed

@@ -1,4 +1,4 @@
-"""Converts recordings between file formats, and computes field tables from them.
+"""Converts recordings between file formats, and computes field tables from recordings.
 
 The file suffixes determine the formats. A conversion between two files with frames copies every frame and the
 journal, so a replay of the result computes the same fields. An MCAP target also receives the fields, contacts
@@ -197,7 +197,7 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
 
 
 def write_computed_field(file: McapFile, field: FieldFrame, rest_m: Float, offset_ns: int) -> None:
-    """Write a field that was computed from a recording; the log time is the time of the scan's last frame.
+    """Write a field computed from a recording; the log time is the time of the scan's last frame.
 
     Args:
         file: The file.
@@ -210,10 +210,10 @@ def write_computed_field(file: McapFile, field: FieldFrame, rest_m: Float, offse
 
 
 class CopiedFrames:
-    """Frames of a recording, each written to a file when it is read.
+    """Iterable over a recording's frames that also writes each frame to a file.
 
     Args:
-        recording: The recording, whose journal is written to the file at once.
+        recording: The recording; the constructor writes its journal to the file.
         file: The file.
     """
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
     """Copy every readable message, with its times, topic and schema.
 
-    If the source is a recording that was not ended properly or is damaged, the journal of the copy says so.
+    If the source is a recording that was not closed properly or is damaged, the journal of the copy records
+    this.
 
     Returns:
         Numbers of CAN frames and fields copied, and a one-line message for each damaged part.
@@ -73,7 +74,7 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
 
 
 def _ends(data: bytes) -> bool:
-    """Return whether a journal line says that the recording was ended properly or has been repaired."""
+    """Return whether a journal line states that the recording was closed properly or has been repaired."""
     with suppress(ValueError, TypeError, KeyError, RecursionError):
         return json.loads(decode(data, JOURNAL_LINE).json)["event"] in ("ended", "repaired")
     return False

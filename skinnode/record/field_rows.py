@@ -1,4 +1,4 @@
-"""Converts fields to table rows: one row per field; no value is missing.
+"""Converts fields to table rows: one row per field, with a value in every column.
 
 Values that a field lacks are filled in: NaN for an unknown number, False for an unknown mask, 1 for an
 unknown data share, and ``displacement_std_m`` for an unknown ``core_std_m``. The column ``tested`` shows

@@ -26,8 +26,8 @@ _POLL_S: Final = 0.2
 def followed(recorder: Recorder, host: Host) -> Iterator[None]:
     """Record the fields, contacts, health and events of ``host`` while the ``with`` block is active.
 
-    If the host closes afterwards, the fields of the scans that end while it closes are recorded too, so the
-    recording contains the same fields as its replay.
+    If the host closes after the block, the fields of scans that end during the shutdown are also recorded, so
+    the recording contains the same fields as its replay.
 
     Has no effect if the recording is not an MCAP file. If the disk is slow, the recorder drops the oldest
     queued fields and counts them in ``RecorderStats.fields_dropped``; the host is not delayed.

@@ -62,7 +62,7 @@ def new_journal_of(log: Path) -> Path:
 
 
 COMPLAINTS_KEPT: Final = 100
-"""Maximum number of unreadable lines reported one by one; any more are only counted."""
+"""Maximum number of unreadable lines reported individually; further lines are only counted."""
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
@@ -146,7 +146,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # missing from journals older than the check
+    checked = table.get("checked", False)  # missing from journals that predate the check
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(

@@ -126,7 +126,7 @@ def read_npz(path: Path) -> tuple[str, Iterator[FieldRow]]:
         First line of the journal, which contains the hand; and the rows, one patch after another.
 
     Raises:
-        ConfigError: The file is not an NPZ field table, or has another version.
+        ConfigError: The file is not an NPZ field table, or has a different version.
     """
     allowed = "an NPZ file of fields written by skinnode convert"
     try:

@@ -81,7 +81,7 @@ class OpenRecording:
     """Name of the file that contains the journal."""
     channels: ChannelMap
     foreign: bool = False
-    """Whether there is no journal; the header and the events were then created from a hand file."""
+    """True if there is no journal, so that the header and the events were created from a hand file."""
     notes: tuple[str, ...] = ()
     """Assumptions made because there is no journal."""
 

@@ -41,7 +41,7 @@ class ParquetFile:
 
         schema = _schema().with_metadata({_KEY: FORMAT.encode(), b"skinnode.hand": hand.encode()})
         self._schema = schema
-        # a dictionary of measured numbers saves no space, but takes four times as long as all the rest
+        # a dictionary of measured numbers saves no space, and takes four times as long as everything else
         texts = ["patch", *TEXTS]
         self._writer = pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
         self._rows: list[dict[str, Any]] = []
@@ -87,7 +87,7 @@ def read_parquet(path: Path) -> tuple[str, Iterator[FieldRow]]:
         First line of the journal, which contains the hand; and the rows.
 
     Raises:
-        ConfigError: The file is not a Parquet field table, or has another version.
+        ConfigError: The file is not a Parquet field table, or has a different version.
     """
     require_pyarrow(path)
     import pyarrow as pa

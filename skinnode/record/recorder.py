@@ -37,12 +37,12 @@ _log = logging.getLogger(__name__)
 FLUSH_S: Final = 0.25
 """Interval between flushes to the kernel, s.
 
-A crash of this process costs the recording at most its last 0.25 s.
+If this process crashes, at most the last 0.25 s of the recording are lost.
 """
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s. A power failure costs the recording about its last second. Each fsync call
-blocks the writer thread for about 10 ms."""
+"""Interval between fsync calls, s. In a power failure, about the last second of the recording is lost. Each
+fsync call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
 """Maximum number of queued batches of frames, enough for several seconds on four fully loaded buses."""
@@ -71,7 +71,7 @@ class RecorderStats:
 
 
 def name_in(folder: Path, hand: HandConfig, kind: RecordingFormat, now: datetime.datetime) -> Path:
-    """Return a path in ``folder`` for a recording, composed of the hand's name, the date and the time."""
+    """Return a path in ``folder`` for a recording, consisting of the hand's name, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -249,7 +249,7 @@ class Recorder:
                     self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> bool:
-        """Queue an entry with a number of frames; return whether the entry was queued or is not wanted."""
+        """Queue an entry of ``frames`` frames; return True if it was queued or is not needed."""
         if self._failure is not None or self._queue.qsize() >= CAPACITY:
             self._lost += frames
             return False
@@ -299,7 +299,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Write and flush everything so far."""
+        """Write and flush all data recorded so far."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)

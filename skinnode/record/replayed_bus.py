@@ -61,7 +61,7 @@ class ReplayedBus:
         self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host set to pre-operational
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """Process the next frame of the log; ``whole`` states whether the log has been undamaged so far."""
+        """Process the next frame of the log; ``whole`` is True if the log has been undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -86,7 +86,7 @@ class ReplayedBus:
         self._dispatcher.measure(frame.t_ns)
 
     def _go_on(self, can_id: int) -> None:
-        """Resume with the same solver after a node restart; no journal states when the host did.
+        """Resume with the same solver after a node restart; no journal records when the host resumed.
 
         After a baseline change, scans remain withheld, because the new baseline is unknown.
         """

@@ -8,15 +8,15 @@
               remote_hand -> commands -> session
 
 ``session`` opens a Zenoh session, ``keys`` names topics and liveliness tokens as rmw_zenoh does, and
-``attachment`` encodes the sequence number of a message as rmw_zenoh does. ``claim`` makes sure that each hand
-has only one daemon. ``description`` tells programs about the hand; ``discovery`` finds the hands that are
-published. ``accounts`` counts received and lost fields. ``connect`` connects a program to a hand.
+``attachment`` encodes the sequence number of a message as rmw_zenoh does. ``claim`` ensures that each hand
+has only one daemon. ``description`` describes the hand to programs, and ``discovery`` finds published hands.
+``accounts`` counts received and lost fields. ``connect`` connects a program to a hand.
 
 **Rules.** The host never waits: it offers fields to a bounded queue. The daemon never waits for a program:
 Zenoh drops messages for a connection whose queue is full. A program never delays its connection: its queue
-drops the oldest message. Each drop appears as a gap in the sequence numbers of a patch.
+drops the oldest message. Each dropped field appears as a gap in its patch's sequence numbers.
 
-This package needs the extra ``zenoh``.
+This package requires the extra ``zenoh``.
 """
 
 from skinnode.remote.connect import connect

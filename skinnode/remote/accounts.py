@@ -9,26 +9,26 @@ from skinnode.messages.full_field import SendStamp
 
 @dataclass(frozen=True, slots=True)
 class PatchCounts:
-    """Counters of a patch in a program, since it connected."""
+    """Counters of a patch since the program connected."""
 
     received: int
     """Number of fields received."""
     lost: int
-    """Number of fields that the daemon has sent but that have not arrived: gaps in the sequence numbers."""
+    """Number of fields that the daemon sent but that did not arrive, from gaps in the sequence numbers."""
     runs: int
-    """Number of runs of the daemon from which fields have arrived."""
+    """Number of daemon runs from which fields have arrived."""
     sequence: int
     """Sequence number of the newest field; 0 before the first."""
     published: int
-    """Number of fields that the daemon has sent in its present run, by its own count in the newest report."""
+    """Number of fields sent in the daemon's current run, as counted by the daemon in its newest report."""
     delay_s: float
-    """Time from sending to receiving of the newest field, s; between machines, as exact as their clocks."""
+    """Transit time of the newest field, s; between machines, only as accurate as their clocks."""
     age_s: float | None
-    """Time since the scan of the newest field was received by the host, s; None before the first field."""
+    """Time since the host received the newest field's scan, s; None before the first field."""
 
 
 class PatchAccount:
-    """Account of a patch. Only the receiver writes to it."""
+    """Received and lost fields of a patch. Only the receiver may call :meth:`add`."""
 
     def __init__(self) -> None:
         self._received = self._lost = self._runs = self._sequence = 0
@@ -38,16 +38,16 @@ class PatchAccount:
         self.published = 0
 
     def add(self, sent: SendStamp, delay_ns: int, t_receive_ns: int) -> bool:
-        """Count a field; return whether it is newer than all fields of its run.
+        """Count a field; return whether it is newer than all earlier fields of its run.
 
         Args:
-            sent: Number and time of the field.
-            delay_ns: Time from sending to receiving, ns.
+            sent: Sequence number and times of the field.
+            delay_ns: Transit time, ns.
             t_receive_ns: Time at which the host received the scan, on this machine's monotonic clock, ns.
         """
         if sent.started_ns != self._started_ns:
             if sent.started_ns < self._started_ns:
-                return False  # a late message of an earlier run
+                return False  # a late message from an earlier run
             self._started_ns, self._sequence = sent.started_ns, sent.sequence - 1
             self._runs += 1
         if sent.sequence <= self._sequence:

@@ -1,6 +1,6 @@
 """Encodes the number, time and publisher of a message as rmw_zenoh does (``attachment_helpers.cpp``).
 
-The layout is that of Zenoh's serialization: two little-endian int64, then the length and the 16 bytes of the
+Zenoh's serialization writes two little-endian int64 values, then the length and the 16 bytes of the
 publisher's ID.
 """
 
@@ -17,22 +17,22 @@ class Attachment(NamedTuple):
     """Attachment of a message."""
 
     sequence: int
-    """Number of the message in its topic, from 1."""
+    """Sequence number of the message on its topic, from 1."""
     sent_ns: int
     """Time since 1970 at which the message was sent, ns."""
     gid: bytes
     """ID of the publisher, 16 bytes."""
 
     def encode(self) -> bytes:
-        """Return the attachment as bytes."""
+        """Encode the attachment as bytes."""
         return _LAYOUT.pack(self.sequence, self.sent_ns, GID_BYTES, self.gid)
 
     @classmethod
     def decode(cls, data: bytes) -> Attachment:
-        """Return the attachment from bytes.
+        """Decode an attachment from bytes.
 
         Raises:
-            ValueError: The bytes are not an attachment of rmw_zenoh.
+            ValueError: The bytes are not an rmw_zenoh attachment.
         """
         if len(data) != _LAYOUT.size or data[16] != GID_BYTES:
             raise ValueError(f"attachment: got {len(data)} bytes, must be {_LAYOUT.size} as by rmw_zenoh")

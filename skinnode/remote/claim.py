@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 class Claim(Closing):
-    """Zenoh session of the only daemon of a hand, until :meth:`close`.
+    """Zenoh session of a hand's only daemon, open until :meth:`close`.
 
     Two daemons that start at the same moment may both be refused. Daemons that cannot reach each other, such
-    as those on two machines whose router does not run, are not refused.
+    as daemons on two machines whose router is not running, are both accepted.
 
     Args:
         hand: The hand.
-        options: Connections of the daemon.
+        options: Connection options of the daemon.
 
     Raises:
         ConfigError: if another daemon publishes the hand or a hand with the same topics, a package is

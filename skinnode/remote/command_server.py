@@ -1,4 +1,4 @@
-"""Executes the commands of programs on a host, one after the other, in a separate thread.
+"""Executes commands from programs on a host, one at a time, in a separate thread.
 
 A request is JSON with ``command`` (``tare`` or ``reset_node``), ``patch`` and, for a tare, ``deadline_s``.
 The reply is empty, or an error as JSON with ``kind``, ``node_id`` and ``text``.
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _WAITING: Final = 16
-"""Maximum number of waiting commands; the daemon refuses further commands."""
+"""Maximum number of queued commands; the daemon refuses further commands."""
 
 
 class CommandServer:
@@ -42,13 +42,13 @@ class CommandServer:
         self._queryable = session.declare_queryable(self._key, self._accept)
 
     def close(self) -> None:
-        """Accept no more commands, and wait for the command in progress."""
+        """Stop accepting commands, and wait for the command in progress to finish."""
         self._queryable.undeclare()
         self._waiting.put(None)
         self._thread.join()
 
     def _accept(self, query: zenoh.Query) -> None:
-        """Queue a command. Called by a thread of Zenoh, which must not wait."""
+        """Queue a command. Called by a Zenoh thread, which must not block."""
         if self._waiting.qsize() >= _WAITING:
             with query:
                 query.reply_err(_error(SkinError(f"{_WAITING} commands are waiting; try again later")))
@@ -60,7 +60,7 @@ class CommandServer:
             with query:
                 try:
                     self._execute(b"" if query.payload is None else query.payload.to_bytes())
-                except Exception as error:  # the program gets the error; the daemon continues
+                except Exception as error:  # the program receives the error; the daemon continues
                     query.reply_err(_error(error))
                 else:
                     query.reply(self._key, b"")

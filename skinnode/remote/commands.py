@@ -1,4 +1,4 @@
-"""Sends commands to the daemon of a hand."""
+"""Sends commands to a hand's daemon."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def send(session: zenoh.Session, hand: str, request: dict[str, Any], deadline_s:
         deadline_s: Time limit of the command, s.
 
     Raises:
-        NodeError: as the host raises it, for example NodeTimeout.
+        NodeError: if the host raises one, for example NodeTimeout.
         SkinError: if no daemon has accepted the command in time.
     """
     payload = json.dumps(request).encode()

@@ -47,7 +47,7 @@ def connect(
     Raises:
         ConfigError: if no such hand is published in time, the router does not answer, an option is invalid,
             or a package is missing.
-        SkinError: if the daemon does not describe the hand in time, or has another version of skinnode.
+        SkinError: if the daemon does not describe the hand in time, or runs a different version of skinnode.
         ValueError: if ``timeout_s`` is out of range.
     """
     check_timeout(timeout_s)
@@ -71,7 +71,7 @@ def connect(
 def _described(
     session: zenoh.Session, hand: str, end_s: float | None, options: SessionOptions
 ) -> Description:
-    """Wait for a daemon of the hand, and for its description."""
+    """Wait for the hand's daemon to appear and to send its description."""
     while True:
         present = bool(tokens(session, hand))
         description = ask(session, hand) if present else None

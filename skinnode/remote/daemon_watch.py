@@ -1,4 +1,4 @@
-"""Watches whether a daemon publishes a hand, by its liveliness tokens."""
+"""Tracks whether a daemon publishes a hand, by means of liveliness tokens."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class DaemonWatch:
-    """Set of the daemons of a hand. The session closes it. Thread-safe.
+    """Tracker of a hand's daemons. Closing the session ends it. Thread-safe.
 
     Args:
         session: Session of the program.
@@ -39,7 +39,7 @@ class DaemonWatch:
         return bool(self._zids)
 
     def _on_change(self, sample: zenoh.Sample) -> None:
-        """Note a change. Threads of Zenoh call it."""
+        """Record a change. Called by Zenoh threads."""
         zid = keys.zid_of(str(sample.key_expr))
         with self._lock:
             if sample.kind == self._put:

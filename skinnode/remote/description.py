@@ -1,4 +1,4 @@
-"""Describes a published hand to programs: its configuration, layouts and the versions of its messages.
+"""Describes a published hand to programs: its configuration, its layouts and its message versions.
 
 The daemon sends the description as JSON in reply to a query.
 """
@@ -34,16 +34,16 @@ class Description:
     """Facts about a published hand that do not change while it runs."""
 
     hand: HandConfig
-    """Configuration of the hand, without the names of files; a program sees ``guest_sends`` as ``sdo``."""
+    """Configuration of the hand, without file names; programs see ``guest_sends`` as ``sdo``."""
     layouts: Mapping[str, PatchLayout]
     """Electrode layout of each patch, by patch name."""
     boot_id: str
-    """ID of the run of the daemon's operating system: processes with the same ID share a monotonic clock."""
+    """Boot ID of the daemon's operating system. Processes with the same boot ID share a monotonic clock."""
     commands: bool
     """Whether the daemon accepts commands."""
 
     def encode(self) -> bytes:
-        """Return the description as JSON."""
+        """Encode the description as JSON."""
         layouts = {
             name: {
                 "upper_m": layout.upper_m.tolist(),
@@ -64,14 +64,14 @@ class Description:
 
     @classmethod
     def decode(cls, data: bytes, hand: str) -> Description:
-        """Return the description from JSON.
+        """Decode a description from JSON.
 
         Args:
-            data: The JSON.
+            data: JSON text.
             hand: Name of the hand, for error messages.
 
         Raises:
-            SkinError: if the daemon has another version of skinnode, whose messages differ.
+            SkinError: if the daemon runs a version of skinnode with different messages.
         """
         try:
             table = json.loads(data)
@@ -91,14 +91,14 @@ class Description:
 
 
 def boot_id() -> str:
-    """Return the ID of the run of this machine's operating system; an empty string if it is unknown."""
+    """Return the boot ID of this machine's operating system, or an empty string if it is unknown."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     return ""
 
 
 def ask(session: zenoh.Session, hand: str) -> Description | None:
-    """Ask the daemon of a hand for its description; return None if there is no answer within a second.
+    """Request a hand's description from its daemon; return None if no reply arrives within a second.
 
     Raises:
         SkinError: see :meth:`Description.decode`.
@@ -110,7 +110,7 @@ def ask(session: zenoh.Session, hand: str) -> Description | None:
 
 
 def _portable(hand: HandConfig) -> HandConfig:
-    """Return the hand without a setting that requires a baseline file, which programs do not have."""
+    """Return the hand without the setting that requires a baseline file, which programs lack."""
     buses = tuple(
         bus.model_copy(update={"guest_sends": "sdo"}) if bus.role == "guest" else bus for bus in hand.buses
     )

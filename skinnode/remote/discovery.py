@@ -1,4 +1,4 @@
-"""Finds the hands that are published."""
+"""Finds published hands."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     import zenoh
 
 _ANSWER_S: Final = 1.0
-"""Time limit for the answers of daemons and routers, s."""
+"""Time limit for replies from daemons and routers, s."""
 
 
 def tokens(session: zenoh.Session, hand: str | None = None) -> list[str]:
-    """Return the tokens of all daemons of a hand, or of all hands."""
+    """Return the tokens of all daemons of a hand, or of all hands if ``hand`` is None."""
     replies = session.liveliness().get(keys.hand_tokens(hand), timeout=_ANSWER_S)
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 

@@ -1,7 +1,7 @@
-"""Names topics, liveliness tokens and the services of a daemon by Zenoh key expressions.
+"""Defines the Zenoh key expressions for a daemon's topics, liveliness tokens and services.
 
 Topics and their tokens follow rmw_zenoh (docs/design.md and liveliness_utils.cpp of ros2/rmw_zenoh), so that
-ROS 2 programs on Jazzy or later see them::
+programs on ROS 2 Jazzy or later can see them::
 
     topic      DOMAIN/TOPIC/TYPE/HASH
     publisher  @ros2_lv/DOMAIN/ZID/NODE/ENTITY/MP/ENCLAVE/NAMESPACE/NAME/TOPIC/TYPE/HASH/QOS
@@ -23,9 +23,9 @@ from skinnode.errors import ConfigError
 from skinnode.messages.typestore import typestore
 
 _NODE: Final = "skinnode"
-"""Name of the ROS 2 node that the daemon represents."""
+"""Name of the ROS 2 node as which the daemon appears."""
 _QOS: Final = "::,:,:,:,,"
-"""rmw_zenoh's text of its default QoS: reliable, volatile, keep last 42 (``qos.cpp``)."""
+"""rmw_zenoh's encoding of its default QoS: reliable, volatile, keep last 42 (``qos.cpp``)."""
 _HIGHEST_DOMAIN: Final = 232
 """Highest domain ID that ROS 2 accepts."""
 
@@ -50,7 +50,7 @@ def dds_type(message: str) -> str:
 
 @functools.cache
 def type_hash(message: str) -> str:
-    """Return the RIHS01 hash of a message definition (REP-2016), which rosbags computes."""
+    """Return the RIHS01 hash of a message definition (REP-2016), as computed by rosbags."""
     return str(typestore().hash_rihs01(message))
 
 
@@ -88,12 +88,12 @@ def publisher_token(zid: str, entity: int, topic: str, message: str) -> str:
 
 
 def hand_token(hand: str, zid: str) -> str:
-    """Return the liveliness token by which a daemon claims a hand."""
+    """Return the liveliness token with which a daemon claims a hand."""
     return f"skinnode/{domain()}/hands/{_quoted(hand)}/{zid}"
 
 
 def hand_tokens(hand: str | None = None) -> str:
-    """Return the expression for the tokens of all daemons of a hand, or of all hands."""
+    """Return the key expression for the tokens of a hand's daemons, or of all daemons if ``hand`` is None."""
     return f"skinnode/{domain()}/hands/{'*' if hand is None else _quoted(hand)}/*"
 
 
@@ -103,7 +103,7 @@ def hand_of(token: str) -> str:
 
 
 def zid_of(token: str) -> str:
-    """Return the ID of the session that has declared a token of a hand."""
+    """Return the ID of the session that declared a hand's token."""
     return token.split("/")[4]
 
 
@@ -118,5 +118,5 @@ def command_key(hand: str) -> str:
 
 
 def _quoted(hand: str) -> str:
-    """Return a hand's name without characters that have a meaning in key expressions."""
+    """Return a hand's name with all special characters percent-encoded, as key expressions require."""
     return quote(hand, safe="")

@@ -1,4 +1,4 @@
-"""Publishes the topics of a hand, as publishers of rmw_zenoh do."""
+"""Publishes a hand's topics as rmw_zenoh publishers do."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ FIELD_TOPICS: Final = {
     "contacts": CONTACTS,
     "contact_wrenches": WRENCH,
 }
-"""Message of each topic of a patch."""
+"""Message name of each patch topic."""
 
 
 class Output:
-    """Publisher of a topic with its liveliness token. Only one thread may call its methods.
+    """Publisher of a topic, with its liveliness token. Only one thread may call its methods.
 
     Args:
-        session: Session of the daemon, which closes the publisher.
+        session: Session of the daemon; closing the session closes the publisher.
         topic: Name of the topic, with a leading slash.
         message: Name of the message.
         entity: Number of the publisher in the session, from 1.
@@ -52,7 +52,7 @@ class Output:
     @property
     def wanted(self) -> bool:
         """Whether any program subscribes to the topic."""
-        status: object = self._publisher.matching_status  # not a bool, as the stubs say
+        status: object = self._publisher.matching_status  # not a bool, although the stubs declare one
         return bool(getattr(status, "matching", status))
 
     def send(self, data: bytes, sent_ns: int) -> None:
@@ -68,7 +68,7 @@ class Output:
 
 
 class Outputs:
-    """Publishers of all topics of a hand, and the node to which they belong. The session closes them.
+    """Publishers of all of a hand's topics, and their ROS 2 node. Closing the session closes them.
 
     Args:
         session: Session of the daemon.
@@ -82,16 +82,16 @@ class Outputs:
             name: {part: self._open(getattr(each, part), message) for part, message in FIELD_TOPICS.items()}
             for name, each in topics.patches.items()
         }
-        """Publishers by patch name and by key of :data:`FIELD_TOPICS`."""
+        """Publishers, by patch name and key of :data:`FIELD_TOPICS`."""
         self.events = self._open(topics.events, LOG)
         self.health = self._open(topics.health, HEALTH_REPORT)
         self.diagnostics = self._open(DIAGNOSTICS, DIAGNOSTIC_ARRAY)
         self.transforms = self._open(TF_STATIC, TRANSFORMS)
         self.wanted: frozenset[tuple[str, str]] = frozenset()
-        """Patch name and key of each topic of a patch to which any program subscribes; see :meth:`look`."""
+        """Patch name and key of each patch topic that has a subscriber; see :meth:`look`."""
 
     def look(self) -> None:
-        """Look up to which topics programs subscribe. Takes too long to be done for each field."""
+        """Find the topics that have subscribers. This is too slow to do for every field."""
         self.wanted = frozenset(
             (name, part)
             for name, each in self.patches.items()

@@ -42,21 +42,21 @@ class PublicationStats:
     """Counters of a publication."""
 
     published: dict[str, int]
-    """Number of fields sent, by patch name; the sequence number of the newest field."""
+    """Number of fields sent, by patch name; equals the sequence number of the newest field."""
     dropped: int
     """Number of fields not sent because this process was too slow."""
     failed: int
-    """Number of exceptions, each of which cost a field or a report."""
+    """Number of exceptions, each of which caused the loss of a field or a report."""
 
 
 class Publication(Closing):
-    """Publishes a host from construction until :meth:`close`.
+    """Publishes a host's data from construction until :meth:`close`.
 
     Programs receive each field as ``skinnode_msgs/Field``. The ROS 2 standard messages are computed only for
-    the topics to which a program subscribes.
+    topics that have a subscriber.
 
     Args:
-        host: Running host, which is never delayed. The publication ends when the host closes.
+        host: Running host, which the publication never delays. The publication ends when the host closes.
         claim: Claim on the hand; the caller closes it.
         commands: Whether programs may tare patches and reset nodes.
 
@@ -84,7 +84,7 @@ class Publication(Closing):
         return PublicationStats(dict(self._published), self._fields.dropped, self._defects.count)
 
     def close(self) -> None:
-        """Stop publishing, and wait for the threads."""
+        """Stop publishing, and wait for the threads to end."""
         self._over.set()
         self._thread.join()
         self._status.close()
@@ -94,7 +94,7 @@ class Publication(Closing):
         self._description.undeclare()
 
     def _describe(self, *, commands: bool) -> zenoh.Queryable[None]:
-        """Answer queries for the description of the hand."""
+        """Answer queries for the hand's description."""
         hand = self._host.hand
         layouts = {name: self._host.layout(name) for name in self._patches}
         key, data = keys.description_key(hand.name), Description(hand, layouts, boot_id(), commands).encode()
@@ -105,7 +105,7 @@ class Publication(Closing):
 
         return self._session.declare_queryable(key, answer)
 
-    # --- the thread of the fields
+    # --- the field thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "publishing a field")
@@ -118,7 +118,7 @@ class Publication(Closing):
             field = self._fields.take(_POLL_S)
         except queue.Empty:
             return True
-        except SkinError:  # the error that stopped the host, which the host reports
+        except SkinError:  # the error that stopped the host; the host reports it
             return False
         if field is None:
             return False

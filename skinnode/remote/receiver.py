@@ -1,4 +1,4 @@
-"""Decodes the messages of a daemon in a separate thread, and passes them on."""
+"""Decodes a daemon's messages in a separate thread, and passes them on."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ TURN_S: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Recipients:
-    """Functions that receive the decoded data, called in the thread."""
+    """Functions that receive the decoded data, called in the receiver's thread."""
 
     field: Callable[[FieldFrame, SendStamp, int], None]
-    """Receives a field with times on this machine's monotonic clock, and the delay of the message, ns."""
+    """Receives a field with times on this machine's monotonic clock, and the message's transit time, ns."""
     report: Callable[[HealthReport], None]
     event: Callable[[HealthEvent], None]
     on_turn: Callable[[], None]
@@ -52,7 +52,7 @@ class _Item(NamedTuple):
 
 
 class Receiver:
-    """Thread that receives from construction until :meth:`close`.
+    """Thread that receives messages from construction until :meth:`close`.
 
     Args:
         session: Session of the program.
@@ -72,7 +72,7 @@ class Receiver:
         self.dropped = 0
         """Number of messages dropped because this process was too slow."""
         self.events_lost = 0
-        """Number of events that the daemon has sent but that have not arrived."""
+        """Number of events that the daemon sent but that did not arrive."""
         self._thread = clock.thread(target=self._run, name="receive")
         self._thread.start()
         topics = HandTopics.of(hand)
@@ -84,14 +84,14 @@ class Receiver:
         ]
 
     def close(self) -> None:
-        """Stop receiving, and wait for the thread."""
+        """Stop receiving, and wait for the thread to end."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._inbox.put(End())
         self._thread.join()
 
     def _handler(self, message: str) -> Callable[[zenoh.Sample], None]:
-        """Return the function that queues a message; threads of Zenoh call it."""
+        """Return the function that queues a message. Zenoh threads call the function."""
 
         def queue_it(sample: zenoh.Sample) -> None:
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
@@ -142,7 +142,7 @@ class Receiver:
         self._events_of = gid, sequence
 
     def _offset_ns(self, wall_minus_mono_ns: int) -> int:
-        """Return this machine's monotonic clock minus the host's, ns, from the wall clocks of both."""
+        """Return this machine's monotonic clock minus the host's, ns, derived from both wall clocks."""
         if self._same_clock:
             return 0
         return wall_minus_mono_ns - (clock.time_ns() - clock.monotonic_ns())

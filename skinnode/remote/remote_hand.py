@@ -1,4 +1,4 @@
-"""Use a hand that another process runs: the same interface to fields, health and events as a host."""
+"""Use a hand run by another process, with the same interface to fields, health and events as a host."""
 
 from __future__ import annotations
 
@@ -31,30 +31,31 @@ if TYPE_CHECKING:
     import zenoh
 
 SILENT_S: Final = 1.0
-"""Time without a report of the health, s, after which the daemon counts as silent; it sends four a second."""
+"""Time without a health report after which the daemon counts as silent, s. The daemon sends four reports per
+second."""
 _RESET_S: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class RemoteStats:
-    """Counters of a program that is connected to a hand."""
+    """Counters of a program connected to a hand."""
 
     patches: Mapping[str, PatchCounts]
     dropped: int
     """Number of messages dropped because this process was too slow; ``lost`` includes their fields."""
     events_lost: int
-    """Number of events that the daemon has sent but that have not arrived."""
+    """Number of events that the daemon sent but that did not arrive."""
     daemon_dropped: int
-    """Number of fields that the daemon has not sent because its process was too slow."""
+    """Number of fields that the daemon did not send because its process was too slow."""
     malformed: int
-    """Number of messages that could not be decoded, and of other exceptions."""
+    """Number of messages that could not be decoded, plus the number of other exceptions."""
 
 
 class RemoteHand(Closing):
     """Hand that a daemon (``skinnode host --publish``) publishes; :func:`skinnode.connect` creates it.
 
     If the daemon ends or the connection fails, subscriptions wait, :meth:`health` reports every patch as lost
-    with the reason, and :attr:`away` gives the reason. The connection is made again in the background.
+    with the reason, and :attr:`away` gives the reason. The connection is re-established in the background.
 
     Threads: any thread may call any method.
 
@@ -125,7 +126,7 @@ class RemoteHand(Closing):
     def latest(self, patch: str) -> FieldFrame | None:
         """Return a patch's newest field without waiting; None before the first field.
 
-        ``stats().patches[patch].age_s`` is the age of the field.
+        ``stats().patches[patch].age_s`` gives the age of the field.
 
         Raises:
             ValueError: if there is no such patch.
@@ -216,7 +217,7 @@ class RemoteHand(Closing):
 
     @property
     def ready(self) -> bool:
-        """Whether the first report of the health has arrived."""
+        """Whether the first health report has arrived."""
         return self._report is not None
 
     def stats(self) -> RemoteStats:
@@ -267,7 +268,7 @@ class RemoteHand(Closing):
             self._accounts[name].published = published
 
     def _on_turn(self) -> None:
-        """Publish an event when the daemon goes or returns, and read the description of a new daemon."""
+        """Publish an event when the daemon disappears or returns, and read a new daemon's description."""
         if self._watch.arrivals != self._described:
             arrivals = self._watch.arrivals
             description = ask(self._session, self.hand.name)

@@ -1,6 +1,6 @@
-"""Opens Zenoh sessions of daemons and programs.
+"""Opens Zenoh sessions for daemons and programs.
 
-Without a router, daemons and programs of one machine find each other on :data:`PORTS` fixed ports of
+Without a router, daemons and programs on the same machine find each other on :data:`PORTS` fixed ports of
 127.0.0.1: each daemon listens on the first free port, and daemons and programs connect to all of them. No
 broker and no multicast are needed. With a router, a daemon also connects to the router, and a program
 connects only to the router.
@@ -28,20 +28,20 @@ LOCAL: Final = "127.0.0.1"
 PORT: Final = 17447
 """First port of daemons on this machine. Zenoh's own routers listen on 7447."""
 PORTS: Final = 16
-"""Number of ports, and thus of daemons, on this machine."""
+"""Number of ports, and thus maximum number of daemons, on this machine."""
 
 _RETRY: Final = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
-"""Pauses between attempts to connect, ms. A connection to this machine is back within 0.2 s."""
+"""Pauses between attempts to connect, ms. A connection on this machine is re-established within 0.2 s."""
 _LEASE_MS: Final = 2000
-"""Time without a sign of life after which a connection is closed, ms. A process that is stopped or a cable
-that is pulled is noticed after this time; a process that ends is noticed immediately."""
+"""Time without messages or keep-alives after which a connection is closed, ms. A suspended process or an
+unplugged cable is detected after this time; a process that ends is detected immediately."""
 _QUEUED: Final = 16
-"""Number of batches (64 KiB each) queued for a connection, the maximum. Zenoh's default, 2, does not hold the
-fields of 16 patches, which are solved at the same time."""
+"""Number of batches (64 KiB each) queued per connection, Zenoh's maximum. Zenoh's default, 2, is too small
+for the fields of 16 patches that are solved at the same time."""
 _SETTLE_S: Final = 1.0
-"""Time limit for connections to the other daemons and to the router at the start, s."""
+"""Time limit for connecting to the other daemons and to the router at startup, s."""
 _ROUTER_MS: Final = 500
-"""Time limit of one attempt of a program to connect to a router, ms."""
+"""Time limit for one attempt by a program to connect to a router, ms."""
 _PAUSE_S: Final = 0.1
 """Pause between these attempts, s."""
 _POLL_S: Final = 0.01
@@ -63,7 +63,7 @@ class SessionOptions:
     config: Path | None = None
     """Zenoh configuration file in JSON5, for TLS and access control."""
     port: int = PORT
-    """First of the ports of daemons on this machine."""
+    """First daemon port on this machine."""
 
     def __post_init__(self) -> None:
         for option, endpoint in (("--router", self.router), ("--listen", self.listen)):
@@ -74,7 +74,7 @@ class SessionOptions:
 
     @property
     def exposed(self) -> str | None:
-        """Endpoint that leaves this machine without TLS; None if there is none."""
+        """Non-local endpoint without TLS; None if there is none."""
         for option, endpoint in (("--router", self.router), ("--listen", self.listen)):
             encrypted = endpoint is None or endpoint.startswith(("tls/", "quic/"))
             if endpoint is not None and not encrypted and not _is_local(host_of(option, endpoint)):
@@ -121,7 +121,7 @@ def require_protected(options: SessionOptions, *, commands: bool) -> None:
         commands: Whether the daemon accepts commands.
 
     Raises:
-        ConfigError: if the daemon accepts commands over an endpoint that leaves this machine without TLS.
+        ConfigError: if the daemon accepts commands over a non-local endpoint without TLS.
     """
     if commands and options.exposed is not None:
         allowed = "only with endpoints of this machine, or tls/… with --zenoh-config"
@@ -129,7 +129,7 @@ def require_protected(options: SessionOptions, *, commands: bool) -> None:
 
 
 def open_daemon(options: SessionOptions) -> zenoh.Session:
-    """Open the session of a daemon. Wait up to a second until it has met the other daemons.
+    """Open a daemon's session, and wait up to a second for connections to the other daemons.
 
     Raises:
         ConfigError: if the configuration is invalid, all ports are in use, or ``options.listen`` cannot be
@@ -149,7 +149,7 @@ def open_daemon(options: SessionOptions) -> zenoh.Session:
             session = zenoh.open(_config(options, settings))
         except zenoh.ZError as error:
             if "in use" in str(error) and options.listen is None:
-                continue  # another daemon has started at this moment
+                continue  # another daemon has just taken this port
             raise _refused(options, error) from None
         _settle(session, options, port)
         return session
@@ -158,12 +158,12 @@ def open_daemon(options: SessionOptions) -> zenoh.Session:
 
 
 def open_program(options: SessionOptions, end_s: float | None) -> zenoh.Session:
-    """Open the session of a program. A connection that is lost is made again in the background.
+    """Open a program's session. A lost connection is re-established in the background.
 
-    Without a router, daemons may appear later. With a router, wait until it answers.
+    Without a router, daemons may appear later. With a router, this function waits until the router answers.
 
     Args:
-        options: Connections of the program.
+        options: Connection options of the program.
         end_s: Monotonic time until which to wait for the router, s; None for no limit.
 
     Raises:
@@ -205,7 +205,7 @@ def _config(options: SessionOptions, settings: dict[str, Any]) -> zenoh.Config:
         "connect/timeout_ms": -1 if settings["mode"] == "peer" else _ROUTER_MS,
         "connect/exit_on_failure": False,
         "connect/retry": _RETRY,
-        "open/return_conditions/connect_scouted": False,  # do not wait for peers that are not there
+        "open/return_conditions/connect_scouted": False,  # do not wait for absent peers
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
         "transport/link/tx/queue/size/data": _QUEUED,
@@ -259,6 +259,6 @@ def _refused(options: SessionOptions, error: Exception) -> ConfigError:
 
 
 def _first_line(error: Exception) -> str:
-    """Return the message of a Zenoh error without the places in Zenoh's source code."""
+    """Return the message of a Zenoh error without locations in Zenoh's source code."""
     text = re.sub(r" at /\S+?\.rs:\d+\.?", "", " ".join(str(error).split()))
     return text[:200]

@@ -1,6 +1,6 @@
 """Publishes the health and the events of a host in a separate thread.
 
-A report of the health of 16 patches takes two milliseconds. Fields would wait for it in a common thread.
+A health report for 16 patches takes 2 ms. In a shared thread, it would delay the fields.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from skinnode.process import clock
 from skinnode.remote.output import Outputs
 
 HEALTH_S: Final = 0.25
-"""Interval between reports of the health, s. It also is the longest time until a new subscription to fields
-takes effect."""
+"""Interval between health reports, s; also the maximum delay before a new subscription to fields takes
+effect."""
 _POLL_S: Final = 0.05
 """Maximum time until :meth:`StatusPublication.close` takes effect, s."""
 
@@ -43,7 +43,7 @@ class StatusPublication:
 
     Args:
         host: Running host.
-        outputs: Publishers; this thread uses those that belong to no patch.
+        outputs: Publishers; this thread uses only the publishers that belong to no patch.
         started_ns: Time since 1970 that identifies the run of the publication, ns.
         counters: Function that returns the counters of the publication.
         defects: Record of exceptions.
@@ -69,7 +69,7 @@ class StatusPublication:
         self._thread.start()
 
     def close(self) -> None:
-        """Send the events that wait, and wait for the thread."""
+        """Send the pending events, and wait for the thread to end."""
         self._over.set()
         self._thread.join()
 
@@ -89,7 +89,7 @@ class StatusPublication:
         return True
 
     def _report(self) -> None:
-        """Look up to which topics programs subscribe, and send the health and the poses."""
+        """Find the topics that have subscribers, and send the health and the poses."""
         now_ns = clock.time_ns()
         self.wall_minus_mono_ns = now_ns - clock.monotonic_ns()
         outputs, host = self._outputs, self._host

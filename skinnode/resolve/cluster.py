@@ -1,6 +1,6 @@
 """Runs units on a Dask cluster, using dask.distributed, an optional dependency.
 
-Dask runs the unit of a lost worker again on another one.
+If a worker is lost, Dask runs its unit again on another worker.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from skinnode.resolve.workers import MOST_DEATHS
 
 _CONNECT_S: Final = 10.0
 _GONE_S: Final = 20.0
-"""Time without a connection to the scheduler after which the cluster counts as gone, s."""
+"""Time without a connection to the scheduler after which the cluster counts as lost, s."""
 
 
 def require_dask() -> None:
@@ -40,7 +40,7 @@ class Cluster(Closing):
 
     Raises:
         ConfigError: dask.distributed is not installed, or no scheduler answers at the address.
-        SkinError: A worker has other software, or there are no workers.
+        SkinError: A worker has different software, or there are no workers.
     """
 
     def __init__(self, address: str, folder: Path) -> None:
@@ -138,7 +138,7 @@ class Cluster(Closing):
         )
 
     def close(self) -> None:
-        """Cancel the units and close the connection; the cluster goes on running."""
+        """Cancel the units and close the connection; the cluster keeps running."""
         with suppress(Exception):  # the cluster may be gone
             self._client.cancel(list(self._futures))
         with suppress(Exception):

@@ -1,4 +1,4 @@
-"""Describes the software of a process. Only processes with the same software compute the same bits.
+"""Describes the software of a process. Only processes with the same software compute bit-identical results.
 
 This module imports nothing from skinnode at the top, because the Dask client sends it to workers by value.
 """
@@ -12,14 +12,14 @@ import importlib.util
 from pathlib import Path
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "pydantic", "python-can")
-"""Packages, besides skinnode, that take part in the computation."""
+"""Packages, besides skinnode, on which the results depend."""
 
 
 def identity() -> dict[str, str]:
     """Return the versions of skinnode and its packages, and the hash of skinnode's source code.
 
     Returns:
-        A version or hash by name; ``none`` for a missing package.
+        Versions and hash by name; ``none`` for a missing package.
     """
     found = {"skinnode": _version("skinnode"), "source code": _hash_of_source()}
     return found | {name: _version(name) for name in PACKAGES}

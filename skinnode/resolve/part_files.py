@@ -1,8 +1,8 @@
 """Reads and writes the results of units: one file each, named after the unit's key.
 
-A part file is written under a temporary name and renamed when it is complete and on the disk. A file with the
-name of a part is therefore always complete, even after a power failure, and the files of a work folder are
-the record of what is done. They are pickles, written and read by the same version of skinnode.
+A part file is written under a temporary name and renamed when it is complete and on disk. A file with the
+name of a part is therefore always complete, even after a power failure, and the files in a work folder show
+which units are finished. The files are pickles, written and read by the same version of skinnode.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from skinnode.errors import SkinError
 from skinnode.files.whole_file import SUFFIX, discard, flush_folder
 
 _OFFSET: Final = struct.Struct("<q")
-"""Offset of the summary, at the end of a part."""
+"""Offset of the summary, stored at the end of a part."""
 _PICKLE_ERRORS: Final = (
     pickle.UnpicklingError,
     EOFError,
@@ -133,6 +133,6 @@ def beside(path: Path) -> Path:
 
 
 def put_in_place(temporary: Path, path: Path) -> None:
-    """Rename a complete file to its final name, and flush its folder to the disk."""
+    """Rename a complete file to its final name, and flush its folder to disk."""
     os.replace(temporary, path)
     flush_folder(path.parent)

@@ -1,4 +1,4 @@
-"""Solves the captured scans of one patch, in their order, as the host would."""
+"""Solves the captured scans of one patch in order, as the host would."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class SolveSummary:
 
 
 class PatchFields:
-    """Fields of a patch. They can be iterated once.
+    """Fields of a patch. They can be iterated only once.
 
     Args:
         hand: The hand with the options of the variant.

@@ -50,8 +50,8 @@ def make_plan(
     Args:
         recordings: Recordings with their hands.
         variants: Variants of the options.
-        folder: Folder of the results.
-        suffix: Suffix of the results.
+        folder: Folder for the results.
+        suffix: Suffix of the result files.
         workers: Number of units that can run at the same time. If there are fewer recordings, the buses of a
             recording are divided among several units, each of which must read the whole recording.
 

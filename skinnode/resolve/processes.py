@@ -1,7 +1,7 @@
 """Runs units in child processes of this computer.
 
-A process that is killed is replaced, and its unit runs again. The standard ``ProcessPoolExecutor`` would give
-up all units instead.
+A killed process is replaced, and its unit runs again. The standard ``ProcessPoolExecutor`` would abandon all
+units instead.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class _Child:
 
 
 class Processes(Closing):
-    """Workers in child processes, which are started when they are needed.
+    """Workers in child processes, which are started on demand.
 
     Args:
         count: Maximum number of processes.
@@ -93,7 +93,7 @@ class Processes(Closing):
             if child is None:
                 return
             child.unit = self._waiting.popleft()
-            with suppress(OSError):  # the process has ended; finished() notices
+            with suppress(OSError):  # the process has ended; finished() detects this
                 child.connection.send(child.unit)
 
     def _start(self) -> _Child:
@@ -143,6 +143,6 @@ def _work(parent: Connection, folder: str, expected: dict[str, str]) -> None:
 
 
 def one_line_of(error: Exception) -> str:
-    """Return the message of one of our exceptions, or type and message of any other."""
+    """Return the message of one of our exceptions, or the type and message of any other exception."""
     text = str(error) if isinstance(error, SkinError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())

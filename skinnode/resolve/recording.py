@@ -14,14 +14,14 @@ from skinnode.record.open_recording import OpenRecording, open_log, open_recordi
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Recording, as it was when the command started."""
+    """Recording in its state when the command started."""
 
     path: Path
     """Absolute path."""
     foreign: bool
     """Whether it is the log of another master, without a journal."""
     state: tuple[tuple[int, int], ...]
-    """Size (bytes) and modification time (ns) of its files."""
+    """Size (bytes) and modification time (ns) of each of its files."""
 
     def opened(self, hand: HandConfig) -> OpenRecording:
         """Open the recording with another hand.

@@ -28,12 +28,12 @@ def write_result(
 ) -> None:
     """Write the fields of all patches to a new file, in the order of a replay.
 
-    The file appears under its name when it is complete.
+    The file appears under its final name only when it is complete.
 
     Args:
         recording: The recording.
         hand: The hand with the options of the variant.
-        solved: Keys of the parts with the fields of the patches.
+        solved: Keys of the parts that contain the patches' fields.
         target: The file; its suffix is one of :data:`FORMATS`.
         parts: Part files.
 

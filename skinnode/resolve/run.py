@@ -59,10 +59,11 @@ def run(
         jobs: The jobs.
         workers: Workers that run the units.
         parts: Part files.
-        tell: Function called with the number of finished units, their total and the newest one.
+        tell: Function called with the number of finished units, the total number of units and the newest
+            finished unit.
 
     Raises:
-        ConfigError: A result exists that this plan has not written.
+        ConfigError: A result exists that this plan did not write.
         SkinError: A unit or all workers failed. Finished units are kept for the next run.
     """
     _require_new(jobs, parts)

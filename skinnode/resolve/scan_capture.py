@@ -1,4 +1,4 @@
-"""Assembles the scans of a recording with the code of the host, and keeps them to be solved later."""
+"""Assembles the scans of a recording with the host's code, and stores them for solving later."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ Place = tuple[int, int, int]
 class CapturedFacts:
     """Facts with which a new solver solves the following scans of a patch.
 
-    The facts are stored as in a journal. When rebuilt, patches with the same layout share its tables.
+    The facts are stored as in a journal. When the facts are rebuilt, patches with the same layout share the
+    layout's tables.
     """
 
     patch: str
@@ -67,7 +68,7 @@ class CaptureSummary:
 
 
 class Capture:
-    """Scans of some buses of a recording. It can be iterated once.
+    """Scans from some buses of a recording. They can be iterated only once.
 
     Args:
         recording: The recording.
@@ -120,7 +121,7 @@ class Capture:
 
 
 class _CapturingSolver(ScanSolver):
-    """Stands in for a solver: passes scans on, and returns empty fields."""
+    """Replaces a solver: passes scans on, and returns empty fields."""
 
     def __init__(self, facts: NodeFacts, keep: Callable[[Scan, ScanStamp, Verdict], None]) -> None:
         self.facts = facts  # the tracker of ScanSolver is not needed

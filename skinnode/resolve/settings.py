@@ -12,7 +12,7 @@ from skinnode.config import HandConfig, PatchConfig, SolverConfig, parse_hand
 from skinnode.errors import ConfigError
 
 _PATCH_KEYS: Final = ("relative_noise", "calibration", "tolerances", "layout")
-"""Keys of a patch that describe its skin, not its identity on the bus."""
+"""Keys of a patch that describe its skin rather than its identity on the bus."""
 _EVERY_PATCH: Final = "*"
 _ALLOWED: Final = (
     "solver.KEY, or patches.NAME.KEY, where NAME is a patch or * for all, "
@@ -38,14 +38,14 @@ Variant = tuple[Setting, ...]
 
 
 def variants(options: Sequence[str]) -> list[Variant]:
-    """Return all combinations of the values of options.
+    """Return all combinations of option values.
 
     Args:
         options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. A value is a TOML value; a value that is not
             TOML is a string.
 
     Raises:
-        ConfigError: An option has no key or value, a key that cannot be set, or occurs twice.
+        ConfigError: An option has no key or no value, has a key that cannot be set, or occurs twice.
     """
     found: dict[str, list[Setting]] = {}
     for option in options:
@@ -77,7 +77,7 @@ def apply(hand: HandConfig, variant: Variant) -> HandConfig:
 
 
 def name_of(variant: Variant) -> str:
-    """Return a short text of a variant, such as ``method=exact drift=none``."""
+    """Return a short description of a variant, such as ``method=exact drift=none``."""
     return " ".join(f"{setting.key.rpartition('.')[2]}={setting.text}" for setting in variant)
 
 
@@ -95,7 +95,7 @@ def _check(key: str) -> None:
 
 
 def _patch_and_key(key: str) -> tuple[str, list[str]]:
-    """Split ``patches.NAME.KEY``; the name may contain dots, because no key of the skin is a usual name."""
+    """Split ``patches.NAME.KEY``; the name may contain dots, because patches are not named after keys."""
     parts = key.split(".")[1:]
     for at in range(1, len(parts)):
         if parts[at] in PatchConfig.model_fields:
@@ -150,7 +150,7 @@ def _split(text: str) -> list[str]:
 
 
 def capture_hand(hand: HandConfig) -> HandConfig:
-    """Return the hand without the settings of the solver; variants with the same result share the scans."""
+    """Return the hand without solver settings; variants with the same result share captured scans."""
     plain = PatchConfig(name="any", node_id=1)
     same = {"calibration": plain.calibration, "tolerances": plain.tolerances}
     patches = tuple(patch.model_copy(update=same) for patch in hand.patches)

@@ -48,7 +48,7 @@ class Unit:
 
     @property
     def details(self) -> tuple[str, ...]:
-        """Further texts that distinguish this unit from the others of its kind."""
+        """Additional strings that distinguish this unit from others of its kind."""
         return ()
 
     def __str__(self) -> str:
@@ -89,7 +89,7 @@ class CaptureScans(Unit):
             part.summary = capture.summary()
 
     def key_of_patch(self, patch: str) -> str:
-        """Return the key of the part with the scans of a patch."""
+        """Return the key of the part that contains a patch's scans."""
         return f"{self.key}-{[each.name for each in self.hand.patches].index(patch)}"
 
 
@@ -142,7 +142,7 @@ class ResultSummary:
 
 @dataclass(frozen=True)
 class WriteResult(Unit):
-    """Unit that writes the fields of all patches to a file; its part has only a :class:`ResultSummary`.
+    """Unit that writes the fields of all patches to a file; its part contains only a :class:`ResultSummary`.
 
     Attributes:
         target: The file.
@@ -173,7 +173,7 @@ class WriteResult(Unit):
     def _summary(self, parts: PartFiles) -> ResultSummary:
         sums: SolveSummary = sum((parts.summary(key) for key in self.solved), SolveSummary())
         captures: list[CaptureSummary] = [parts.summary(key) for key in self.captured]
-        flaws = dict.fromkeys(text for each in captures for text in each.flaws)  # each read all frames
+        flaws = dict.fromkeys(text for each in captures for text in each.flaws)  # each reads all frames
         losses = [text for each in captures for text in each.losses]
         notes = dict.fromkeys(text for each in captures for text in each.notes)
         return ResultSummary(sums, (*flaws, *losses), tuple(notes))
@@ -185,11 +185,11 @@ def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> 
     Args:
         unit: The unit.
         folder: The work folder.
-        expected: Identity of the process that makes the plan.
+        expected: Identity of the process that made the plan.
         worker: Name of this worker, for error messages.
 
     Raises:
-        SkinError: This process has other software or does not see the work folder, or the unit fails.
+        SkinError: This process has different software or cannot see the work folder, or the unit fails.
     """
     found = difference(expected, _own_identity())
     if found is not None:
@@ -205,7 +205,7 @@ def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> 
 
 
 def refused(worker: str, found: str) -> SkinError:
-    """Return the error for a worker with other software."""
+    """Return the error for a worker with different software."""
     return SkinError(
         f"worker {worker}: refused, because it has {found}, and its results could differ; "
         "install the same version there, or end that worker"

@@ -30,4 +30,4 @@ class Workers(Protocol):
 
 
 MOST_DEATHS = 3
-"""Number of workers that may end while running the same unit."""
+"""Number of worker deaths while running the same unit after which the unit fails."""

@@ -26,7 +26,7 @@ ROUGH_AT_PATH_END  0.8    roughness / size that triggers a second attempt   corr
 SMOOTH_PATH        0.2    maximum secant error / size on a smooth path      correct ≤ 0.2, wrong ≥ 0.24
 LONG_PATH          20     minimum number of samples in a long path          one path that left and returned
 ROOT_RESIDUAL      1e-9   maximum RMS of F/b − 1 at a root                  not measured
-STILL_CONFIRMED    0.2    maximum relative change of a confirmed root       not measured
+STILL_CONFIRMED    0.2    maximum relative change in a confirmed root       not measured
 SAME_ROOT          0.001  maximum relative distance of identical roots      not measured
 TWIN_REACH         2      maximum relative distance of a twin               staggered, h = 0.3 to 1
 TWIN_ROUGHNESS     1.05   minimum roughness of a twin / that of the root    82 + 60 + 40 presses, staggered

@@ -25,7 +25,7 @@ CAPACITY_FRAMES: Final = 16384
 frames/s)."""
 
 _POLL_S: Final = 0.02
-"""Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
+"""Maximum time (s) to wait for a frame before the thread checks whether it must stop."""
 _POLL_NS: Final = round(_POLL_S * 1e9)
 
 GATHER_NS: Final = 1_500_000
@@ -129,7 +129,7 @@ class Intake:
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Announce that a response will follow a request, which was sent at monotonic time ``t_ns``."""
+        """Announce that a response to a request sent at monotonic time ``t_ns`` is expected."""
         self._asked_ns = t_ns
 
     # --- called by the receiving thread
@@ -260,7 +260,7 @@ class Receiver(Closing):
             self._on_signal(intake)  # frames may have arrived before
             return
         if intake in self._alone:
-            # The error makes the old thread end, so it must not be cleared before.
+            # The error makes the old thread end, so it must not be cleared earlier.
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
@@ -283,7 +283,7 @@ class Receiver(Closing):
     def _fetch_signalled(self) -> None:
         """Fetch the announced frames. Every :data:`_POLL_S`, fetch from all ports.
 
-        This finds the failure of a port, and notes the time on a port without frames.
+        This detects a failed port, and updates :attr:`Intake.seen_ns` of a port without frames.
         """
         now_ns = clock.monotonic_ns()
         intakes = _drained(self._announced)
@@ -354,7 +354,7 @@ class Receiver(Closing):
             try:
                 if self._stop.is_set() or intake.failed:
                     return
-                # After a time-out, fetch once more: frames may have arrived while the thread was suspended.
+                # After a timeout, fetch once more: frames may have arrived while the thread was suspended.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
                     self._fresh.append(intake)
                     self._notify()

@@ -1,4 +1,4 @@
-"""Draws a complete recording as fast as possible to a file for later viewing.
+"""Draws a complete recording to a file for later viewing, as fast as possible.
 
 Unlike :mod:`skinnode.view.drawing_thread`, this module skips no fields: the replay waits for the drawing. All
 times, including event times, are recording times.
@@ -72,7 +72,7 @@ class Conversion:
         return DrawnCounts(self._drawn, 0, 0)
 
     def run(self, draw: Draw) -> None:
-        """Draw all the recording's fields and the hand's state.
+        """Draw all of the recording's fields, and the hand's state.
 
         Args:
             draw: Function that draws the data of one instant.

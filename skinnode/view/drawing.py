@@ -144,7 +144,7 @@ class HandDrawing:
         """Write the new data of one instant.
 
         Args:
-            tick: New fields and, from time to time, the hand's state.
+            tick: New fields and, at some instants, the hand's state.
         """
         if not self._begun:
             self._begin(

@@ -1,4 +1,4 @@
-"""Draws in a low-priority child process, which leaves the CPU and the interpreter lock to the host.
+"""Draws in a low-priority child process, to leave the CPU and the interpreter lock to the host.
 
 Drawing 16 patches 30 times per second takes a third of a CPU core. In a thread of the host process, this work
 would compete with the host for the interpreter lock, and the host would skip scans.

@@ -1,4 +1,4 @@
-"""Converts a whole recording to a file of Rerun, as fast as possible."""
+"""Converts a whole recording to a Rerun file, as fast as possible."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def convert_to_file(
     Args:
         path: The recording.
         save: The file.
-        exaggeration: Factor by which displacements are drawn enlarged.
+        exaggeration: Ratio of drawn to measured displacement.
         hand: Hand for a log without a journal; see :func:`skinnode.record.replay.replay`.
         cancelled: Function called before each frame; the conversion ends when it returns True.
 

@@ -1,4 +1,4 @@
-"""Opens the outputs of a drawing: a window, a web page, a file, or a file together with one of the others."""
+"""Opens the outputs of a drawing: a window or a web page, a file, or both."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Output:
     viewer: ViewerProcess | None
     """Window, or data server for browsers; None if the drawing goes only to a file."""
     page_url: str | None
-    """URL of the web page; None without ``web``."""
+    """URL of the web page; None if there is no web page."""
     save: Path | None
     """File to write; None if no file is written."""
 

@@ -1,4 +1,4 @@
-"""Computes a field's picture as arrays: surface, arrows and contacts. Does not require the viewer."""
+"""Computes a field's picture as arrays: surface, arrows and contacts. The viewer is not required."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places the patches in the picture: at their poses from the hand file or, without poses, side by side."""
+"""Places the patches in the picture, at their poses from the hand file or, without poses, side by side."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ class Placement:
     skeleton: Skeleton
     """Patch poses on their links, and link poses in the hand."""
     side_by_side: bool
-    """Whether the patches are drawn side by side, because the hand file puts several in the same place."""
+    """Whether the patches are drawn side by side, because the hand file puts several patches in the same
+    place."""
 
     def path(self, patch: str) -> list[str]:
         """Return the parts of a patch's entity path: ``skin``, the link's name and the patch's name."""

@@ -13,7 +13,7 @@ from skinnode.view.outputs import Target
 _APPLICATION: Final = "skinnode"
 _FLUSH_S: Final = 5.0
 _BATCH_MS: Final = 20
-"""Maximum time that the SDK holds data back, ms; shorter than the interval between two pictures."""
+"""Maximum time for which the SDK holds data back, ms; shorter than the interval between two pictures."""
 
 
 @contextmanager

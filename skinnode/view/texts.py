@@ -66,7 +66,7 @@ def _wrench_row(name: str, wrench: Wrench) -> tuple[str, ...]:
 
 
 def health_text(view: View, counts: DrawnCounts, notes: Iterable[str] = ()) -> str:
-    """Return the text that gives the state of all patches and buses, and the field counts.
+    """Return the text that describes the state of all patches and buses, and gives the field counts.
 
     Args:
         view: State of the hand.

@@ -21,5 +21,5 @@ class Tick:
     """New fields, by patch name."""
     counts: DrawnCounts
     view: View | None = None
-    """State of the hand; None if it is not drawn at this instant."""
+    """State of the hand; None if the state is not drawn at this instant."""
     events: Sequence[HealthEvent] = ()

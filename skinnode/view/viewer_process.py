@@ -27,7 +27,7 @@ from skinnode.process.closing import Closing
 
 LOCAL: Final = "127.0.0.1"
 MEMORY: Final = "512MB"
-"""Memory limit for data kept for browsers; beyond it, the oldest data are dropped."""
+"""Memory limit for data kept for browsers. Beyond this limit, the oldest data are dropped."""
 _STYLES: Final = re.compile(r"\x1b\[[0-9;]*m")
 _READY_S: Final = 30.0
 _END_S: Final = 5.0

@@ -1,8 +1,8 @@
 """Serves the rerun-sdk viewer to a browser, without any access to other computers.
 
-The SDK's page loads fonts from elsewhere, and its viewer sends usage statistics. This server passes the page
-on without the fonts and with a content security policy: the browser blocks every connection except to this
-server and to the data port. The page also disables the statistics setting that the viewer stores in the
+The SDK's page loads fonts from other computers, and its viewer sends usage statistics. This server passes on
+the page without the fonts and with a content security policy: the browser blocks every connection except to
+this server and to the data port. The page also disables the statistics setting that the viewer stores in the
 browser.
 """
 
@@ -24,14 +24,15 @@ _FILES: Final = ("/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/apple-
 _ELSEWHERE: Final = re.compile(
     rb"<link\b[^>]*https?://[^>]*>|<script\b[^>]*\bsrc=\"https?://[^>]*>\s*</script>"
 )
-"""Page elements that load something from another computer."""
+"""Page elements that load resources from other computers."""
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
 _NO_STATISTICS: Final = (
     b"<script>localStorage.setItem('rerun_config', "
     b"JSON.stringify({analytics_id: 'none', analytics_enabled: false}));</script>"
 )
 _OPTIONS: Final = {"hide_welcome_screen": "1", "persist": "0"}
-"""Page query: disables the welcome screen, which loads examples, and the saved layout of an earlier visit."""
+"""Query of the page, which disables the welcome screen (which would load examples) and the saved layout of an
+earlier visit."""
 
 
 class WebPage(Closing):
@@ -88,7 +89,7 @@ def page_of(page: bytes) -> bytes:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers GET requests for the page and the viewer files; every other path gives 404."""
+    """Answers GET requests for the page and the viewer files; returns 404 for every other path."""
 
     ports: tuple[int, int]
     otherwise: str
@@ -129,7 +130,7 @@ class _Handler(BaseHTTPRequestHandler):
             return answer.read()
 
     def _pass_on(self, path: str) -> None:
-        """Pass on an SDK file in pieces, because the largest file is 43 MB."""
+        """Pass on an SDK file in chunks, because the largest file is 43 MB."""
         connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
         connection.request("GET", path)
         with connection.getresponse() as answer:

@@ -1,4 +1,4 @@
-"""The search for explanations: its gain is the change of the log evidence, computed here with dense matrices.
+"""The search for explanations: its gain is the change in the log evidence, computed here with dense matrices.
 
 With S the covariance of the readings, a load of variance τ² and response b adds τ² b bᵀ to S, and a reading
 that is wrong is left out of the data. The log evidence is that of a normal distribution (scipy.stats).

@@ -1,4 +1,4 @@
-"""Application of a scene to a hand: checks of the touches, and a :class:`PatchScene` for each patch."""
+"""Applies a scene to a hand: checks the touches, and creates a :class:`PatchScene` for each patch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fault schedule of a scene, from its ``[[faults]]`` tables, with checks against the hand."""
+"""Creates a scene's fault schedule from its ``[[faults]]`` tables, and checks the faults against the hand."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]
 def _check_together(
     schedule: FaultSchedule, late: TimedFault, hand: HandConfig, shapes: dict[str, tuple[int, int]]
 ) -> None:
-    """Raise ConfigError if a fault contradicts those that are active when it starts."""
+    """Raise ConfigError if a fault contradicts faults that are active when it starts."""
     values: dict[str, Any] = {}
     for each in schedule.active(late.from_s):
         if (each.place, each.on_bus) == (late.place, late.on_bus):

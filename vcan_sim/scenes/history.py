@@ -91,7 +91,7 @@ class History:
         return self.window.grid.size_m
 
     def step(self, number: int) -> Step | None:
-        """Return the state at time ``number * step_s``; None without contact."""
+        """Return the state at time ``number * step_s``; None if there is no contact."""
         index = number - self.first
         if index < 0 or number > self.last:
             return None

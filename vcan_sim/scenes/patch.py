@@ -47,7 +47,7 @@ class PatchScene:
 
     @property
     def end_s(self) -> float:
-        """Scene time at which the last touch ends, s; 0 without touches."""
+        """Scene time at which the last touch ends, s; 0 if there are no touches."""
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:

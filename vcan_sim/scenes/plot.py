@@ -59,7 +59,7 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
 
 
 def _depth_m(truth: PatchTruth) -> float:
-    """Return the maximum contact depth (m) on a patch; 0 without contact."""
+    """Return the maximum contact depth (m) on a patch; 0 if there is no contact."""
     return max((contact.depth_m for contact in truth.contacts), default=0.0)
 
 

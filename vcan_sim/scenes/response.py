@@ -15,7 +15,7 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Maximum range of the table of displacement against distance, in layer thicknesses. Beyond it, the
+"""Maximum range of the table of displacement versus distance, in layer thicknesses. Beyond it, the
 displacement is below ``FAR``."""
 CLUSTER_CELLS: Final = 6.0
 """Distance from the window, in cells, beyond which each block of 2 × 2 cells acts as one point force."""
@@ -23,7 +23,7 @@ FAR: Final = 1e-5
 """Threshold below which the displacement due to a point force is neglected, relative to the maximum. In a
 bonded layer, the displacement decays exponentially with distance from the force."""
 POINTS: Final = 4096
-"""Number of points in the table of displacement against distance from a point force."""
+"""Number of points in the table of displacement versus distance from a point force."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Electrodes:
     places_m: Float
     surface_m: float
     _table: Float
-    """(POINTS, 4) table of r Z, r A, r B and r K over the distance r, m²/N; see
+    """(POINTS, 4) table of r Z, r A, r B and r K versus distance r, m²/N; see
     :class:`vcan_sim.contact.layer.PointResponse` for Z, A, B and K."""
     _step_m: float
     _far_m: float
@@ -112,7 +112,7 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Return a table of displacement against distance from a point force, and its step in metres.
+    """Return a table of displacement versus distance from a point force, and its step in metres.
 
     The half-space solution is that of Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections 3.2
     and 3.6). :class:`vcan_sim.contact.layer.PointResponse` adds the correction for a layer.

@@ -1,6 +1,6 @@
-"""Checks of a touch against its patch: depth or force, position, and distance from other touches.
+"""Checks a touch against its patch: depth or force, position, and distance from other touches.
 
-Checks that need no patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
+Checks that do not require a patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ _TURNS: Final = 12
 _SEARCHES: Final = 40
 """Maximum number of depths tried in a search for a given force."""
 _NOWHERE_M: Final = -1.0
-"""Lower limit of the overlap, metres. Points outside the body have this value."""
+"""Lower limit of the overlap, metres. Points outside the body are given this value."""
 
 
 class TooMuch(ValueError):
@@ -147,7 +147,7 @@ def solve_depth(
     With few cells in contact, the power law fails; every second step therefore bisects the bracket.
 
     Args:
-        force_n: Function from depth (m) to force (N). Its last call is made with the returned depth.
+        force_n: Function from depth (m) to force (N). The last call uses the returned depth.
         target_n: Target force, N, positive.
         known: Known depth (m) and force (N). The first trial depth follows from them with F ∝ δ^1.5.
         close: Tolerance of the force, relative to the target.
@@ -166,7 +166,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # what remains is the error of the contact solver
+        if high - low < 0.1 * close * high:  # the remaining difference is the error of the contact solver
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:

@@ -10,7 +10,7 @@ upper nodes and w of the lower nodes (Ho, Ruehli and Brennan, IEEE Trans. Circui
     ⎢          ⎥ ⎢   ⎥ = ⎢              ⎥,    A_u = diag(C 1) + T_u,    A_l = diag(Cᵀ 1) + T_l
     ⎣ −Cᵀ  A_l ⎦ ⎣ w ⎦   ⎣ into nodes   ⎦
 
-A_l is tridiagonal, so w is eliminated first. What remains for v is a system with the Schur complement
+A_l is tridiagonal, so w is eliminated first. The matrix of the remaining system for v is the Schur complement
 A_u − C A_l⁻¹ Cᵀ.
 """
 

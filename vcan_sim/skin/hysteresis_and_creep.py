@@ -37,12 +37,12 @@ _RECENT: Final = 128
 _KEPT_EVERY: Final = 64
 """Number of time steps (2 s) between states that are stored for longer."""
 _KEPT: Final = 300
-"""Number of states stored at intervals of ``_KEPT_EVERY`` steps (ten minutes). Of older states, only every
-``_THINNED``-th is kept."""
+"""Number of states stored at intervals of ``_KEPT_EVERY`` steps (ten minutes). Only every ``_THINNED``-th
+older state is kept."""
 _THINNED: Final = 64
 
 Load = Callable[[float], "Float | None"]
-"""Function from time (s) to the displacement (U, N, 3) without hysteresis and creep (m); None at rest."""
+"""Function from time (s) to the displacement (U, N, 3) in m, without hysteresis and creep; None at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,6 +139,6 @@ class History:
             return State(play, followed, state.delayed)
         risen = -np.expm1(-dt_s / self._creep_s)
         lag = (followed - state.followed) * (self._creep_s / dt_s)
-        # exact if ``followed`` is linear within the step
+        # exact if ``followed`` varies linearly within the step
         delayed = followed - lag * risen + (state.delayed - state.followed) * (1.0 - risen)
         return State(play, followed, delayed)

@@ -31,8 +31,8 @@ class PhysicalPatch:
     only on time, not on earlier calls. Without imperfections, the resistances equal those of
     :class:`ExactForward` bit for bit.
 
-    The read-outs ``grounded`` and ``floating`` contain a simplification: the paths of each upper wire have
-    their conductances at the sampling time of that wire, even while another upper wire is sampled. Only sneak
+    The read-outs ``grounded`` and ``floating`` are simplified: the paths of each upper wire have their
+    conductances at the sampling time of that wire, even while another upper wire is sampled. Only sneak
     currents are affected.
 
     Args:
@@ -73,7 +73,7 @@ class PhysicalPatch:
             shared.setflags(write=False)
 
     def upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions of the upper electrodes during a scan of the patch.
+        """Return the upper electrodes' true positions during a scan of the patch.
 
         Args:
             t_s: Scene time at which the first upper wire is sampled, s.

@@ -1,4 +1,4 @@
-"""Deterministic model of a CAN bus with exact event times, without threads and without a clock.
+"""Deterministic model of a CAN bus with exact event times, without threads or a clock.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Course of one transmission attempt: whether and when its frame is delivered or destroyed.
+"""Determines whether and when the frame of a transmission attempt is delivered or destroyed.
 
 :func:`undisturbed` handles the common case, which requires only the number of bits. :func:`disturbed`
 examines the individual bits of the frame.

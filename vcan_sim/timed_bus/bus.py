@@ -1,9 +1,9 @@
 """Simulated CAN bus: arbitration, transmission attempts, error counters and events.
 
-A frame starts at once if the bus is idle, and otherwise at the end of the intermission. A frame queued less
-than one bit time after a start of frame still takes part in the arbitration (Davis, Burns, Bril, Lukkien,
-"Controller Area Network (CAN) schedulability analysis", 2007, section 3). Arbitration is therefore decided
-one bit time after the start of frame.
+A frame starts immediately if the bus is idle, and otherwise at the end of the intermission. A frame queued
+less than one bit time after a start of frame still takes part in the arbitration (Davis, Burns, Bril,
+Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). Arbitration is therefore
+decided one bit time after the start of frame.
 
 The model has no propagation delay and no oscillator tolerance: all stations see each bit at the same time.
 """
@@ -92,7 +92,7 @@ class TimedBus:
         for rule in disturbances:
             self.disturb(rule)
 
-    # --- what stations do
+    # --- operations of stations
 
     def send(self, time_ns: int, station: int, frame: CanFrame) -> bool:
         """Queue a frame for transmission.
@@ -667,7 +667,7 @@ class TimedBus:
             self._recovering.append(station)
 
     def _runs(self, station: Station, until: int) -> int:
-        """Return the number of complete recessive runs that a recovering station has seen by ``until``."""
+        """Return the number of complete recessive runs that a recovering station has seen until ``until``."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)

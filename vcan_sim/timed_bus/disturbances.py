@@ -1,6 +1,6 @@
 """Rules that inject bit errors.
 
-A disturbance inverts one bit of a frame, for all stations or for a single one. Rules apply to every
+A disturbance inverts one bit of a frame, for all stations or for a single station. Rules apply to every
 transmission attempt, so they can also destroy retransmissions.
 """
 

@@ -43,7 +43,7 @@ class ErrorFrame(NamedTuple):
 
     time_ns: int
     stations: tuple[int, ...]
-    """Stations whose frame failed and will be sent again; empty if only a receiver lost the frame."""
+    """Stations whose frame failed and will be retransmitted; empty if only a receiver lost the frame."""
     frames: tuple[CanFrame, ...]
     """Frame on the bus, or the colliding frames in the order of ``stations``."""
     bit: int

@@ -1,4 +1,4 @@
-"""CAN frames, as a station hands them to its controller."""
+"""CAN frames, as a station passes them to its controller."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ class CanFrame(_Fields):
 
     Args:
         can_id: Identifier of 11 bits, or of 29 bits if ``extended``.
-        data: Data: 0 to 8 bytes, and in CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty in a remote
-            frame.
+        data: Data: 0 to 8 bytes, or 12, 16, 20, 24, 32, 48 or 64 bytes in CAN FD; empty in a remote frame.
         extended: Whether the identifier has 29 bits.
         remote: Whether the frame is a remote frame.
         dlc: Data length code (DLC) of a remote frame, 0 to 8; ignored for data frames.

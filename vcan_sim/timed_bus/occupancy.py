@@ -10,7 +10,7 @@ class Occupancy:
     """Record of the busy intervals of a bus.
 
     Adjacent intervals are merged, so a saturated bus needs a single entry of 24 bytes. In long runs,
-    :meth:`forget` limits the memory.
+    :meth:`forget` limits memory use.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Occupancy:
         self._busy_before.append(before)
 
     def end_last_at(self, end_ns: int) -> None:
-        """Change the end of the last busy interval, ns."""
+        """Move the end of the last busy interval to ``end_ns``."""
         self._ends[-1] = end_ns
 
     def busy_ns(self, from_ns: int, to_ns: int) -> int:

@@ -72,7 +72,7 @@ class FifoQueue:
 
 
 class PriorityQueue:
-    """Transmit queue ordered by priority. Frames of equal priority are sent in the order of arrival."""
+    """Transmit queue ordered by priority. Frames of equal priority are sent in order of arrival."""
 
     def __init__(self) -> None:
         self._frames: list[Waiting] = []

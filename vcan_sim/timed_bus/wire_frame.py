@@ -102,8 +102,9 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
     """Return the number of bits of an error flag after which a receiver detects an error.
 
     The flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or the form
-    of the delimiters and the end of frame. Failing that, it makes the CRC wrong, which a receiver signals
-    after the ACK delimiter (ISO 11898-1:2015). The receiver destuffs the bits that it sees.
+    of the delimiters and the end of frame. If it violates none of these rules, it corrupts the CRC, and a
+    receiver signals the error after the ACK delimiter (ISO 11898-1:2015). The receiver destuffs the bits that
+    it sees.
 
     Args:
         wire: bit sequence of the frame.
@@ -138,7 +139,7 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
         if at < delimiter:
             wrong = bool(wire.fixed_stuff) and (at - start) % _FIXED_STUFF_SPACING == 0 and bit == before
         elif at == delimiter + 2:
-            wrong = bit == 0 or at > position  # form error, or wrong CRC
+            wrong = bit == 0 or at > position  # form error or CRC error
         else:
             wrong = bit == 0 and at != delimiter + 1
         if wrong and at >= position:

@@ -122,7 +122,7 @@ class PatchApplication:
         self.source.reset(self._now())
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state."""
+        """Handle a change in the NMT state."""
         self._operational = operational
         if operational:
             self._acquisition.selection.forget()

@@ -38,7 +38,7 @@ class ChunkSelection:
 
         Args:
             codes: (U, K) codes of the scan.
-            threshold: largest change of a code that is not sent.
+            threshold: largest change in a code that is not sent.
             full_every: interval between full scans, scans; 0 for no regular full scans.
 
         Returns:

@@ -118,7 +118,7 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state.
+        """Handle a change in the NMT state.
 
         Pending RPDOs are dropped. Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so
         monitoring stops and RPDO timeout errors end.

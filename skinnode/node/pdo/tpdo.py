@@ -130,7 +130,7 @@ class Owner(Protocol):
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Handle a change of a TPDO's parameters or owner."""
+        """Handle a change in a TPDO's parameters or owner."""
         ...
 
 

@@ -55,7 +55,7 @@ def likeliest(
     Args:
         p: (m, m) precision of the readings.
         alpha: (m,) P z.
-        z: (U, K) changes of the readings since rest, in units of their noise.
+        z: (U, K) changes in the readings since rest, in units of their noise.
         present: (U, K) mask of the available readings. Two readings are exchanged only if both are available.
         far: Whether to test all pairs of wires rather than only neighbours. Testing all pairs takes ten times
             as long.

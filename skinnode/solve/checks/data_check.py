@@ -98,7 +98,7 @@ class DataCheck:
     Args:
         problem: The patch.
         sigma: Typical relative noise of a reading, for :meth:`prepare`.
-        model_std: Standard deviation of the forward model's error, relative to the largest change of a
+        model_std: Standard deviation of the forward model's error, relative to the largest change in a
             reading; 0 if the patch matches its layout exactly.
         drift: Expected gain errors, which are not reported as faults: ``none``, ``patch`` (one error for the
             patch) or ``wire`` (one for each upper wire).

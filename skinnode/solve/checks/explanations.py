@@ -100,7 +100,7 @@ class Explainer:
         """Return the groups of wrong readings; empty if loads or noise explain the frame well enough.
 
         Args:
-            z: (U, K) changes of the readings since rest, in units of their noise.
+            z: (U, K) changes in the readings since rest, in units of their noise.
             present: (U, K) mask of the readings to use.
             evidence: (L,) log evidence of the frame at each κ.
             best: Index of the κ with the largest log evidence.

@@ -65,7 +65,7 @@ class GreedySearch:
 
         Args:
             number: Index of κ.
-            z: (U, K) changes of the readings since rest, in units of their noise.
+            z: (U, K) changes in the readings since rest, in units of their noise.
             present: (U, K) mask of the readings to use.
             cost: Log evidence subtracted for each wrong reading, nats.
             faults: Whether the explanation may contain wrong readings.

@@ -119,7 +119,7 @@ def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch
 
     Args:
         tables: Cholesky factors of the wires' blocks of P and S.
-        z: (U, K) changes of the readings since rest, in units of their noise.
+        z: (U, K) changes in the readings since rest, in units of their noise.
         alpha: (m,) P z.
         present: (U, K) mask of the available readings.
         sigma: Relative noise of the readings.

@@ -1,4 +1,4 @@
-"""Touch detection: decide before solving whether a patch is touched, and which frames need no solve.
+"""Touch detection: decide before solving whether a patch is touched, and which frames need not be solved.
 
 ``touch_detector`` decides for each frame. It uses ``touch_test`` (the thresholds of the test statistic),
 ``touch_statistic`` (the statistic), ``touch_kernel`` (the compiled part), ``touch_odds`` (the odds of touch),

@@ -5,9 +5,9 @@ patch's gain changes with temperature. Each gain is a random walk. The filter es
 of untouched frames, so its error is the error after the last block plus the drift since then. Over minutes, a
 steady drift at an unknown rate dominates the random walk, because its variance grows with the square of time.
 
-A change common to all upper wires looks like a change common to all lower wires, or like one of the patch.
-The filter therefore uses coordinates v in which every change is visible: the readings change by Q v, with
-orthonormal columns of Q. All variances are in units of a reading's noise variance.
+A change common to all upper wires looks like a change common to all lower wires, or like a change in the
+patch's gain. The filter therefore uses coordinates v in which every change is visible: the readings change by
+Q v, with orthonormal columns of Q. All variances are in units of a reading's noise variance.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import numpy as np
 from skinnode.model.layout import Float
 
 DRIFT: Final = 0.01
-"""Standard deviation of the change in a wire's gain in one hour. It applies to the steady drift, and to the
+"""Standard deviation of the change in a wire's gain over one hour. It applies to the steady drift, and to the
 random walk until the drift of the stream has been measured."""
 PATCH_DRIFT: Final = 0.02
-"""Standard deviation of the change in the patch's gain in one hour, used like :data:`DRIFT`. The skin's
+"""Standard deviation of the change in the patch's gain over one hour, used like :data:`DRIFT`. The skin's
 temperature changes faster than its wires age."""
 MEASURED_S: Final = 2.0
 """Interval over which a stream's random walk is measured, s. Over this interval, the measured random walk
@@ -68,18 +68,18 @@ class GainFilter:
     basis_t: Float
     """(V, m) matrix Qᵀ with orthonormal rows."""
     to_gains: Float
-    """(U + K + 1, V) gains for given v. A combination of gains that no reading shows is zero."""
+    """(U + K + 1, V) gains for given v. A combination of gains that affects no reading is zero."""
     by_wires: Float
     """(V, V) covariance of v if the gains of all wires have a variance of 1."""
     by_patch: Float
     """(V, V) covariance of v if the gain of the patch has a variance of 1."""
     of_uppers: Float
-    """(V, V) matrix whose product with the covariance of v, summed over all elements, is the variance of an
-    upper wire's gain about the mean of the upper wires."""
+    """(V, V) matrix whose element-wise product with the covariance of v, summed over all elements, is the
+    variance of an upper wire's gain about the mean of the upper wires."""
     of_lowers: Float
     """(V, V) matrix for the lower wires, like ``of_uppers``."""
     of_mean: Float
-    """(V,) coefficients of the mean change of all readings."""
+    """(V,) coefficients of the mean change in all readings."""
 
     @classmethod
     def of(cls, shape: tuple[int, int], ratios: bytes) -> GainFilter:

@@ -14,7 +14,7 @@ from skinnode.solve.detect.gain_drift import GainFilter
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 SETTLED: Final = 1e-5
-"""Relative change of the variances from block to block, below which the covariance counts as constant."""
+"""Relative change in the variances from block to block below which the covariance counts as constant."""
 WIRES, MEAN = 0, 1
 """Positions of the variances in ``variances``."""
 
@@ -29,13 +29,13 @@ class GainArrays(ArrayTable):
     by_patch: Annotated[NDArray[np.float64], "V V", READONLY]
     """Covariance of v if the gain of the patch has a variance of 1."""
     of_uppers: Annotated[NDArray[np.float64], "V V", READONLY]
-    """Weights of the covariance of v in the variance of an upper wire's gain."""
+    """Weights by which the covariance of v contributes to the variance of an upper wire's gain."""
     of_lowers: Annotated[NDArray[np.float64], "V V", READONLY]
-    """Weights of the covariance of v in the variance of a lower wire's gain."""
+    """Weights by which the covariance of v contributes to the variance of a lower wire's gain."""
     of_mean: Annotated[NDArray[np.float64], "V", READONLY]
-    """Coefficients of the mean change of all readings."""
+    """Coefficients of the mean change in all readings."""
     mean: Annotated[NDArray[np.float64], "m"]
-    """Mean change of the readings in a block of untouched frames."""
+    """Mean change in the readings in a block of untouched frames."""
     expected: Annotated[NDArray[np.float64], "m"]
     """Changes expected without a touch."""
     offset: Annotated[NDArray[np.float64], "m"]
@@ -47,8 +47,8 @@ class GainArrays(ArrayTable):
     variances: Annotated[NDArray[np.float64], "2"]
     """Largest variance of a wire's gain about its layer's mean, and variance of the mean change."""
     settled: Annotated[NDArray[np.float64], "3"]
-    """Growth of a wire's variance and of the patch's at the last update, and 1 if this update left the
-    covariance as it was, else 0."""
+    """Growth of a wire's variance and of the patch's variance at the last update; then 1 if this update left
+    the covariance unchanged, otherwise 0."""
     beyond: Annotated[NDArray[np.float64], "m"]
     """Work array."""
     inverse: Annotated[NDArray[np.float64], "V V"]
@@ -131,9 +131,9 @@ def _find_variances(its: GainArrays) -> None:
 
 @njit_part
 def _update_covariance(its: GainArrays, wires: float, patch: float, frames: int) -> None:
-    """Let the covariance grow, and reduce it by a block; the arguments are those of :func:`use_block`.
+    """Grow the covariance by the drift, then update it with a block; see :func:`use_block` for arguments.
 
-    Most blocks of a stream follow each other at once, so the covariance soon stays the same.
+    Most blocks of a stream are consecutive, so the covariance soon becomes constant.
     """
     settled, variances = its.settled, its.variances
     same = settled[0] == wires and settled[1] == patch
@@ -162,7 +162,7 @@ def _update_covariance(its: GainArrays, wires: float, patch: float, frames: int)
 
 @njit
 def find_variances(table: NDArray[np.int64]) -> None:
-    """Compute ``variances`` after the covariance of :class:`GainArrays` was set."""
+    """Compute ``variances`` after the covariance of :class:`GainArrays` has been set."""
     its = arrays_of(table)
     its.settled[2] = 0.0
     _find_variances(its)

@@ -1,12 +1,12 @@
 """Ongoing touch: decides when the touch has ended.
 
-While the patch is touched, the gains drift, so the readings expected at rest become less and less certain. A
+While the patch is touched, the gains drift, so the expected readings at rest become less and less certain. A
 touch therefore ends in one of four ways:
 
-- the readings agree with those expected at rest when the touch began;
-- the readings have changed towards rest, and agree with it within the drift since the onset;
+- the readings agree with the values that were expected at rest when the touch began;
+- the readings have changed towards rest, and agree with the rest values within the drift since the onset;
 - a small fraction of the touch remains and stays constant, because the rubber creeps;
-- the readings have agreed with rest, within the drift, for half an hour.
+- the readings have agreed with the rest values, within the drift, for half an hour.
 
 A held press meets none of these conditions for ten minutes, however slight it is.
 """
@@ -27,7 +27,8 @@ RESIDUE_S: Final = 10.0
 FORGOTTEN_S: Final = 1800.0
 """Time after which a touch that is indistinguishable from drift ends, s."""
 AVERAGED_S: Final = 1.0
-"""Averaging time of a touch's readings, with which later readings are compared to detect a change, s."""
+"""Averaging time for a touch's readings, s. Later readings are compared with this average to detect a
+change."""
 
 
 @dataclass(slots=True)
@@ -37,7 +38,7 @@ class HeldTouch:
     test: TouchTest
     """Test used at the onset."""
     average: Float
-    """(m,) average change of the readings, excluding the last frames."""
+    """(m,) average change in the readings, excluding the last frames."""
     average_features: Float
     """Features of ``average``; see :class:`skinnode.solve.detect.touch_statistic.TouchBasis`."""
     period_s: float
@@ -55,14 +56,14 @@ class HeldTouch:
     def follow(
         self, features: Float, at: int, oldest: Float, variance: float, later: TouchTest
     ) -> bool | None:
-        """Process a frame; return whether the touch ended, or None if it ended and creep remains.
+        """Process a frame; return True if the touch ended, None if it ended and creep remains, else False.
 
         Args:
             features: (4, F) features of the last four frames.
             at: Index of the first of these frames in ``features``.
-            oldest: (m,) changes of the readings in the first of these frames.
+            oldest: (m,) changes in the readings in the first of these frames.
             variance: Noise variance of the stream, relative to the stated variance.
-            later: Test that allows for the drift since the onset.
+            later: Test that accounts for drift since the onset.
         """
         self.frames += 1
         now = 0.25 * (features[0] + features[1] + features[2] + features[3])
@@ -96,7 +97,7 @@ class HeldTouch:
     def _follow_change(
         self, now: Float, oldest_features: Float, oldest: Float, variance: float, later: TouchTest
     ) -> None:
-        """Detect a change by comparing the last frames with the average of the touch before them."""
+        """Detect a change by comparing the last frames with the touch's average before these frames."""
         share = 1.0 / min(max(1.0, AVERAGED_S / self.period_s), self.frames)
         spread = variance * (1.0 / KEPT + share)
         average = self.average_features

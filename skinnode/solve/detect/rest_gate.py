@@ -24,7 +24,7 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISIER: Final = 1.25
-"""Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
+"""Minimum factor between a frame's noise and the detector's for the detector to adopt the frame's noise."""
 SAME: Final = 0.1
 """Maximum relative change in noise for which a rest field stays valid."""
 
@@ -79,13 +79,13 @@ class RestGate:
         noise: Float | None,
         left_out: NDArray[np.bool_] | None,
     ) -> FieldFrame | None:
-        """Return the field of a frame if it need not be solved; None if it must be solved.
+        """Return a frame's field if the frame need not be solved; None if it must be solved.
 
         Args:
             ohm: (U, K) resistances, ohm.
-            valid: (U, K) bool, False for missing readings; None if there are none.
+            valid: (U, K) bool: False for missing readings; None if no readings are missing.
             noise: (U, K) relative noise of this frame; None for the stated noise.
-            left_out: (U, K) bool, True for faulty readings; None if there are none.
+            left_out: (U, K) bool: True for faulty readings; None if no readings are faulty.
         """
         start = perf_counter()
         if left_out is not None:
@@ -113,7 +113,7 @@ class RestGate:
         )
 
     def add(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of the solved frame with ``touched`` and ``touch_odds``."""
+        """Return a solved frame's field with ``touched`` and ``touch_odds`` filled in."""
         verdict = self._verdict
         if (
             self._gates
@@ -142,7 +142,7 @@ class RestGate:
             self._field = None
 
     def _fits(self, noise: Float | None) -> bool:
-        """Return whether the last frame has the same usable readings and noise as the rest field."""
+        """Return whether the last frame has the same usable readings and the same noise as the rest field."""
         before = self._noise_of_field
         if (noise is None) != (before is None):
             return False

@@ -1,8 +1,8 @@
 """Slow state of an untouched patch: the wires' gains, the readings' offsets, and the measured drift.
 
-The state is estimated from blocks of untouched frames. A block is used only after the next block is
-complete, so that the frames just before the detection of a touch do not enter the estimate. Each reading also
-has an offset, which follows errors in R₀, rounding and creep over minutes.
+The state is estimated from blocks of untouched frames. A block is used only after the next block is complete,
+so that the frames just before a touch is detected do not enter the estimate. Each reading also has an offset,
+which follows errors in R₀, rounding and creep over minutes.
 
 The prior of the drift is a random walk with a standard deviation of
 :data:`skinnode.solve.detect.gain_drift.DRIFT` after one hour. The drift of the stream is then measured by
@@ -32,27 +32,27 @@ BLOCK: Final = 4
 HELD_BACK: Final = 2.0
 """Maximum age of the newest frame in the estimate while the patch is untouched, blocks."""
 FINER: Final = math.sqrt(2.0)
-"""Ratio of successive drifts that the detector distinguishes."""
+"""Ratio between successive drift levels that the detector distinguishes."""
 PRIOR: Final = 8.0
-"""Number of independent drift measurements after which the stated drift no longer counts."""
+"""Number of independent drift measurements after which the stated drift is ignored."""
 WITHIN_S: Final = 120.0
-"""Averaging time of a stream's drift, s."""
+"""Averaging time for a stream's drift, s."""
 MOST_DRIFT: Final = 2.0
 """Maximum drift, relative to the stated drift."""
 OFFSET_S: Final = 600.0
-"""Averaging time of the readings' offsets, s."""
+"""Averaging time for the readings' offsets, s."""
 OFFSET_FRAMES: Final = 100
 """Weight of an offset of zero in the average, in frames."""
 CREEP: Final = 6.0
 """Ratio of the time since the last release to the averaging time of the offsets, which is at most
-:data:`OFFSET_S`. The averaging time increases because rubber creeps back more and more slowly."""
+:data:`OFFSET_S`. The averaging time increases because rubber creeps back ever more slowly."""
 START_S: Final = 60.0
 """Assumed time from the measurement of the baseline to the first frame, s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Facts about a stream that its slow state needs."""
+    """Facts about a stream that its slow state requires."""
 
     filter: GainFilter
     """Filter for the gains."""
@@ -75,7 +75,7 @@ class SlowState:
         shape: Numbers U and K of upper and lower wires.
 
     Attributes:
-        expected: (U, K) expected changes of an untouched patch's readings, in units of their noise.
+        expected: (U, K) expected changes in an untouched patch's readings, in units of their noise.
         age: Number of frames since the newest frame in the estimate.
         offset_share: Error variance of the offsets, relative to the noise variance.
         level: Indices in ``WIRE_VARIANCES`` and ``PATCH_VARIANCES`` of the variances that cover the current
@@ -131,7 +131,7 @@ class SlowState:
         self.level = self._level_at(self._base)
 
     def _level_at(self, age: int) -> tuple[int, int]:
-        """Return the level that covers the gains when the newest frame is ``age`` frames old."""
+        """Return the level that covers the gains' uncertainty when the newest frame is ``age`` frames old."""
         wires, patch = self._growth.after(age * self._stream.period_s)
         wire_level = _least(WIRE_VARIANCES, self._variances[WIRES] + wires)
         mean = self._variances[MEAN] + wires * self._mean_share + patch
@@ -139,7 +139,7 @@ class SlowState:
 
     @property
     def drift(self) -> float:
-        """Currently assumed standard deviation of the change in a wire's gain in one hour."""
+        """Currently assumed standard deviation of the change in a wire's gain over one hour."""
         return self._drift
 
     @property
@@ -151,8 +151,8 @@ class SlowState:
         """Add an untouched frame; return whether :attr:`expected` or :attr:`level` changed.
 
         Args:
-            y: (U, K) unexpected changes of the readings, in units of their noise.
-            present: (U, K) mask of the readings; None if all are present.
+            y: (U, K) unexpected changes in the readings, in units of their noise.
+            present: (U, K) mask of the available readings; None if all are available.
             noise: Noise variance of the stream, relative to the stated variance.
         """
         self._pass_frame()
@@ -217,7 +217,7 @@ class SlowState:
             self._set_age(0)
 
     def carry_on(self, gains: Float, expected: Float) -> None:
-        """Continue with the gains and expected changes of the same stream at a different noise.
+        """Continue with the gains and expected changes of the same stream at a different noise level.
 
         Args:
             gains: (U + K + 1,) relative changes in conductance; see :attr:`gains`.
@@ -269,7 +269,7 @@ class SlowState:
         sums = 0.0
         for moved, count, other in ((by_rows, upper, lower), (by_columns, lower, upper)):
             if count > 1:
-                about = moved - common  # the mean of all readings is that of the rows and of the columns
+                about = moved - common  # the mean over rows, or over columns, is that of all readings
                 variance = float(about @ about) / (count - 1) - of_noise / other
                 sums += variance * other / (upper + lower)
         found = sums / seconds
@@ -286,7 +286,7 @@ class SlowState:
             self._set_drift(drift, patch_drift)
 
     def _chosen(self, used: float, stated: float, measured: float, std: float) -> float:
-        """Return the drift (standard deviation in one hour) to assume.
+        """Return the drift (standard deviation after one hour) to assume.
 
         Args:
             used: Currently assumed drift.

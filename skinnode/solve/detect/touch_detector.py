@@ -1,4 +1,4 @@
-"""Touch detector of one patch: decides, before anything is solved, whether the patch is touched.
+"""Touch detector of one patch, which decides before a frame is solved whether the patch is touched.
 
 A touch begins when the statistic of a frame, or of the mean of three frames, exceeds its threshold
 (:mod:`skinnode.solve.detect.touch_test`). :mod:`skinnode.solve.detect.held_touch` decides when it has ended.
@@ -36,7 +36,7 @@ from skinnode.solve.detect.touch_test import TouchTest, touch_tests
 ENOUGH: Final = 0.5
 """Minimum fraction of usable readings. With fewer, the detector makes no decision."""
 ODD_READING: Final = 6.0
-"""Change of a single reading, in standard deviations, above which a frame is solved and its data are checked.
+"""Change in a single reading, in standard deviations, above which a frame is solved and its data are checked.
 Noise exceeds this limit in one of 1,700,000 frames of 300 readings."""
 ODD_WIRE: Final = 8.0
 """Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data are
@@ -53,14 +53,14 @@ NOISE_STEP: Final = 1.25
 
 @dataclass(frozen=True, slots=True)
 class TouchVerdict:
-    """Decision about a frame."""
+    """Decision for a frame."""
 
     touched: bool | None
     """Whether the patch is touched; None if too few readings are usable."""
     odds: float
     """Odds of touch to no touch; see :attr:`skinnode.FieldFrame.touch_odds`."""
     quiet: bool
-    """Whether the frame need not be solved: the patch is untouched and no reading is unusual."""
+    """Whether the frame need not be solved, because the patch is untouched and no reading is unusual."""
 
 
 class TouchDetector:
@@ -72,7 +72,7 @@ class TouchDetector:
         noise: (U, K) relative standard deviation of the readings, excluding quantization.
         rounding: (U, K) relative standard deviation of the quantization error.
         period_s: Scan period, s.
-        false_alarms_per_hour: Accepted number of false alarms in an hour.
+        false_alarms_per_hour: Accepted number of false alarms per hour.
         gain_std: (U + K + 1,) initial standard deviations of the gains; None for a fresh baseline.
 
     Attributes:
@@ -129,7 +129,8 @@ class TouchDetector:
     def _configure(self) -> None:
         """Create the slow state and the tests for the current noise.
 
-        The ratios between the readings' noise are those at the start, so that the tests stay valid.
+        The ratios between the readings' noise levels stay the same as at the start, so that the tests remain
+        valid.
         """
         sigma = np.hypot(self._factor * self._own, self._rounding)
         # noise of half a code or more makes the quantization errors of successive frames independent
@@ -155,7 +156,7 @@ class TouchDetector:
         self._use_test()
 
     def prepare(self) -> None:
-        """Compute all tests, so that none delays a frame of a stream. Patches of a layout share the tests."""
+        """Compute all tests, so that none delays a frame. Patches with the same layout share the tests."""
         self._tests.prepare()
 
     def _use_test(self) -> None:
@@ -174,7 +175,7 @@ class TouchDetector:
         self._arrays.expected[:] = 0.0
 
     def set_noise(self, factor: float, noise: Float | None = None) -> None:
-        """Change the noise, and keep the state of the stream.
+        """Change the noise without losing the state of the stream.
 
         Args:
             factor: Factor that multiplies the stated noise, excluding quantization.
@@ -231,11 +232,11 @@ class TouchDetector:
         valid: NDArray[np.bool_] | None = None,
         noise: Float | None = None,
     ) -> TouchVerdict:
-        """Decide about the next frame.
+        """Decide whether the patch is touched in the next frame.
 
         Args:
             ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False for readings to be ignored; None to use all readings.
+            valid: (U, K) bool: False for readings to ignore; None to use all readings.
             noise: (U, K) relative noise of this frame, including quantization; None for the usual noise.
         """
         its = self._arrays

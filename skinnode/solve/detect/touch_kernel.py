@@ -28,11 +28,11 @@ class TouchArrays(ArrayTable):
     rest: Annotated[NDArray[np.float64], "U K"]
     """Resistances at rest, ohm."""
     weight: Annotated[NDArray[np.float64], "U K"]
-    """1 / σ of each reading, or less if the frame is noisier than usual; 0 for readings to be ignored."""
+    """1 / σ of each reading, or less if the frame is noisier than usual; 0 for readings to ignore."""
     expected: Annotated[NDArray[np.float64], "U K"]
     """Changes y expected without a touch, computed from the gains and offsets."""
     recent: Annotated[NDArray[np.float64], "4 m"]
-    """Unexpected changes of the last frames."""
+    """Unexpected changes in the readings of the last frames."""
     responses: Annotated[NDArray[np.float64], "R m", READONLY]
     """Bᵀ: the part of the features that depends on the responses to loads."""
     ratios: Annotated[NDArray[np.float64], "U K", READONLY]
@@ -103,7 +103,7 @@ def _features(responses: Float, ratios: Float, y: Float, features: Float) -> Non
 
 @njit_part
 def _log_ratio(z: Float, shares: Float, log_dets: Float, octaves: int, variance: float) -> float:
-    """Return the log of the mean of exp ½ (Σ share z² / variance − log_det) over the octaves."""
+    """Return the logarithm of the mean over the octaves of exp ½ (Σ share z² / variance − log_det)."""
     most, total = -np.inf, 0.0
     for j in range(octaves):
         row, square = shares[j], 0.0
@@ -193,7 +193,7 @@ def see_frame(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def retest(table: NDArray[np.int64], rows: Float, expected: Float, at: int, frames: int) -> None:
-    """Recompute the statistics of the last frames for other expected changes and another test.
+    """Recompute the statistics of the last frames for different expected changes and a different test.
 
     Args:
         table: Table of :class:`TouchArrays`.

@@ -1,4 +1,4 @@
-"""Odds of touch to no touch: Bayes' rule, frame by frame, for a patch that is touched now and then."""
+"""Odds of touch to no touch: Bayes' rule, frame by frame, for a patch that is touched occasionally."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def octaves_for(noise: float) -> int:
 
 
 def log_likelihood_ratio(statistic: Statistic, octaves: int, z: Float) -> float:
-    """Return the log likelihood ratio of touch to no touch for a frame with the z (r,) of ``statistic``.
+    """Return a frame's log likelihood ratio of touch to no touch, given its z (r,) from ``statistic``.
 
     All ``octaves`` of depth are equally likely.
     """

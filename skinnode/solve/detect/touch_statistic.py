@@ -1,8 +1,8 @@
 """Statistic of the touch test: a quadratic form of the readings, one for each uncertainty of the gains.
 
-Let y = ln(R₀/R)/σ be the changes of the readings from rest, in units of their noise, after subtraction of
-the estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ includes the noise and the errors
-of the gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
+Let y = ln(R₀/R)/σ be the changes in the readings from rest, in units of their noise, after subtraction of the
+estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ includes the noise and the errors in the
+gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
 readings' response to loads at a depth that noise almost hides. A touched frame therefore has
 y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
@@ -17,8 +17,8 @@ the gains are computed before a stream starts, and choosing another one during a
 P is diagonal: wires have one of the variances :data:`WIRE_VARIANCES`, and the patch has one of
 :data:`PATCH_VARIANCES`.
 
-The odds of touch allow for depths c times as large, for which c² μ_i replaces μ_i. The log likelihood ratio
-is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)).
+The odds of touch also account for other depths: at a depth c times as large, c² μ_i replaces μ_i. The log
+likelihood ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)).
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from skinnode.solve.posterior.load_cells import LoadCells
 
 DEPTH: Final = 5.0
 """RMS normal displacement in the alternative hypothesis, in layer heights times the relative noise. At a
-noise of 1e-3, this is 0.5 % of the layer height. Tests for 0.25 % to 1 % detect touches almost equally well;
-tests for 2 % and more detect fewer presses of 2 %."""
+noise of 1e-3, this is 0.5 % of the layer height. Tests for 0.25 % to 1 % detect touches almost equally well.
+Tests for 2 % or more detect fewer of the presses that are 2 % deep."""
 SHALLOWEST: Final = 0.5
 """Minimum RMS normal displacement in the odds, relative to that in the alternative hypothesis."""
 MOST_OCTAVES: Final = 24
@@ -45,12 +45,13 @@ MOST_OCTAVES: Final = 24
 LEAST_WEIGHT: Final = 0.02
 """Minimum weight κ² λ of an eigenvector of the elastic prior in the test."""
 MOST_VECTORS: Final = 96
-"""Maximum number of eigenvectors of the elastic prior in the test. The cost is proportional to it."""
+"""Maximum number of eigenvectors of the elastic prior in the test. The cost is proportional to this
+number."""
 WIRE_VARIANCES: Final = (*(2.0 ** np.arange(-9.0, 2.0)).tolist(), 1e6)
 """Variances of a wire's gain about the mean of its layer, in units of a reading's noise variance. The
 smallest has little effect on the test; with the largest, the gains are unknown."""
 PATCH_VARIANCES: Final = (*(2.0 ** np.arange(-12.0, 0.0)).tolist(), 1e6)
-"""Variances of the gain of the patch, like :data:`WIRE_VARIANCES`."""
+"""Variances of the patch's gain, in the same units as :data:`WIRE_VARIANCES`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +67,19 @@ class Statistic:
     log_dets: Float
     """(MOST_OCTAVES,) Σ ln(1 + c² μ)."""
     by_gains: Float
-    """(r, r) part of the covariance of z that the errors of the gains cause."""
+    """(r, r) part of the covariance of z that is due to errors in the gains."""
 
     def weights_of_mean(self, frames: int) -> Float:
         """Return the weights (r,) of w ‖mean z‖² for the mean of w = ``frames`` frames.
 
-        Noise is independent from frame to frame; the errors of the gains are the same in all frames.
+        Noise is independent from frame to frame; the errors in the gains are the same in all frames.
         """
         covariance = np.diag(self.weights) + (frames - 1) * self.by_gains
         return np.asarray(np.maximum(np.linalg.eigvalsh(covariance), 1e-12))
 
 
 class TouchBasis:
-    """Features of a kind of patch, and its statistics.
+    """Features and statistics for patches of one kind.
 
     Args:
         layout: The patch.

@@ -3,7 +3,7 @@
 The thresholds follow from the distribution of the statistic without a touch
 (:mod:`skinnode.solve.detect.weighted_chi_squared`). In the mean of w successive frames, the squared
 signal-to-noise ratio of a touch is w times that of one frame, because noise is independent from frame to
-frame. The errors of the gains are not independent, so the mean has its own distribution and threshold.
+frame. The errors in the gains are not independent, so the mean has its own distribution and threshold.
 Quantization errors may be the same in successive frames. The thresholds are then interpolated linearly
 between those for independent noise and those for noise that is the same in all frames.
 """
@@ -50,7 +50,7 @@ class Thresholds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TouchTest:
-    """Touch test for one patch, one rate of false alarms and one uncertainty of the gains."""
+    """Touch test for one patch, one false-alarm rate and one uncertainty of the gains."""
 
     statistic: Statistic
     """Statistic."""
@@ -116,7 +116,7 @@ def touch_tests(
         ratios: (U, K) noise of each reading divided by the median, as float64.
         coded: Fraction of the noise variance that is the same in successive frames.
         period_s: Scan period, s.
-        false_alarms_per_hour: Accepted false alarms per hour.
+        false_alarms_per_hour: Accepted number of false alarms per hour.
     """
     frames_per_alarm = 3600.0 / (period_s * false_alarms_per_hour)
     chance = min(1.0 / (frames_per_alarm * len(WINDOWS)), 0.1)
@@ -125,7 +125,7 @@ def touch_tests(
 
 @functools.lru_cache(maxsize=4096)
 def _thresholds(basis: TouchBasis, wires: int, patch: int, chance: float) -> tuple[Thresholds, Thresholds]:
-    """Return the thresholds for noise that is independent from frame to frame, and for noise that is not."""
+    """Return the thresholds for noise that is independent in each frame, and for noise that is not."""
     statistic = basis.statistic(wires, patch)
     one, three = statistic.weights, statistic.weights_of_mean(WINDOWS[1])
     four = statistic.weights_of_mean(RELEASE_FRAMES)

@@ -1,4 +1,4 @@
-"""Tail of a weighted sum of χ² variables, the distribution of the touch statistic on an untouched patch.
+"""Tail of a weighted sum of χ² variables, the touch statistic's distribution on an untouched patch.
 
 The tail of T = Σ w_i z_i² for independent standard normal z_i follows from the cumulant generating function
 K(t) = −½ Σ ln(1 − 2 t w_i) by the saddle-point approximation of Lugannani and Rice (Advances in Applied
@@ -95,7 +95,7 @@ def _tail(weights: Float, value: float) -> float:
         mean += weight
         squares += weight * weight
         cubes += weight * weight * weight
-    if abs(t) * mean < 1e-4:  # near the mean, where the formula is 0/0
+    if abs(t) * mean < 1e-4:  # near the mean, where the formula becomes 0/0
         skewness = 8.0 * cubes / (2.0 * squares) ** 1.5
         found: float = 0.5 - skewness / (6.0 * math.sqrt(2.0 * math.pi))
         return found

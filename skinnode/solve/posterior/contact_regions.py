@@ -375,7 +375,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
         weight: (m,) factor of each row.
         share: (Q,) prior variances of the loads, relative to ``scale2``.
         scale2: Squared scale s² of the prior, pitch².
-        own: (Q,) bool, whether a cell has an electrode.
+        own: (Q,) bool: True for a cell with an electrode.
         near: (Q, 9) indices of each cell and its neighbours; −1 outside the lattice.
         before: (Q,) contact number of each cell in the last frame.
         number: (Q,) receives the contact number of each cell; 0 for cells without contact and for the

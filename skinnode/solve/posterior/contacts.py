@@ -247,7 +247,7 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     ``std``. The variances are multiplied by ``doubt``, because the distribution of the load over the
     cells depends mainly on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work arrays.
 
-    Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the pressing
+    Returns the cell closest to the centre, True if pulling loads were left out, and the sum of the pressing
     loads in N.
     """
     size, every, pressing = 0, 0.0, 0.0

@@ -44,7 +44,7 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise assumed in a solve; also allows for errors of the forward model. With less noise,
+"""Minimum relative noise assumed in a solve; also accounts for errors in the forward model. With less noise,
 every solve would end at a root of F = b, which can be the wrong root. On layouts with folds (det J = 0),
 wrong roots occur even at a noise of 1e-5."""
 LEFT_OUT: Final = 3
@@ -463,7 +463,7 @@ class FrameEstimator:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = self._hyper.with_spread(estimator.std, estimator.core)
-        if held.all():  # allow for displacements too small for the gate to detect
+        if held.all():  # account for displacements too small for the gate to detect
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

@@ -33,7 +33,7 @@ SCALE_STEP: Final = math.log(1.25)
 the scale."""
 SCALE_LEAST: Final = 1.0
 """Minimum prior scale, relative to the scale at which the expected changes in the resistances equal their
-noise. Displacements below the noise cannot be detected, so the standard deviations must allow for them."""
+noise. Displacements below the noise cannot be detected, so the standard deviations must account for them."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the hyperparameters per frame."""
 DISC_FITS: Final = 2
@@ -113,7 +113,7 @@ class Hyperparameters:
     def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
         """Return both standard deviations (U, f) in pitches, including the uncertainty of the discs.
 
-        The first result also allows for a further touch that is too light to be detected.
+        The first result also accounts for a further touch that is too light to be detected.
         """
         if self.discs is None:
             return std, core

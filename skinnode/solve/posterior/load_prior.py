@@ -27,7 +27,7 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 PRIOR_DOUBT: Final = 3.0
-"""Factor applied to the part of the variance that depends on the prior; allows for the uncertainty of the
+"""Factor applied to the part of the variance that depends on the prior; accounts for the uncertainty of the
 expected loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement
 errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
 SMOOTH_SHARE: Final = 0.25
@@ -50,7 +50,7 @@ value improves the displacement if the rubber behaves like a half-space; otherwi
 become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells where no load was found, relative to the mean over the patch. A positive
-value allows for light touches near a press."""
+value accounts for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
 """Fraction of the expected loads that must change location for the prior to be rebuilt. In slow presses,
 displacement errors reached 6 standard deviations with a fraction of 0.5. With 0.25, the prior was rebuilt

@@ -21,7 +21,7 @@ from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 
 PLACED: Final = 2.0
-"""Assumed error of a reading per pitch of placement error, as a fraction of the largest change of any
+"""Assumed error of a reading per pitch of placement error, as a fraction of the largest change in any
 reading."""
 
 

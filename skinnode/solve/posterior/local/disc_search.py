@@ -47,7 +47,7 @@ deviations from discs would be too small."""
 PAYS: Final = 2.0
 """Minimum gain in log evidence for a further disc, in excess of the logarithm of the number of parameters."""
 NOTICED: Final = 8.0
-"""Minimum squared match between a load and the remaining data for a further disc to be tried, in noise
+"""Minimum squared match between a load and the remaining data at which a further disc is tried, in noise
 variances."""
 NEAR: Final = 1.0
 """Radius of the discs that are matched to the data to find a starting point, cells."""
@@ -110,7 +110,7 @@ class DiscPrior:
         *,
         spread: bool,
     ) -> Float | None:
-        """Fit the discs to a frame, and return the load variances (2, Q) in pitch².
+        """Fit the discs to a frame, and return the load variances (2, Q), pitch².
 
         The estimator's factors are overwritten.
 
@@ -119,7 +119,7 @@ class DiscPrior:
             members: Wires whose equations are used.
             untouched2: s² of the loads on untouched skin, pitch².
             uniform2: s² of equal loads over the whole patch, pitch².
-            spread: Whether to compute :attr:`spread` as well.
+            spread: Whether to compute :attr:`spread` too.
 
         Returns:
             The variances; None if the loads are not local.
@@ -193,7 +193,7 @@ class _Search:
         return np.asarray(self._p._place[best])
 
     def with_disc_at(self, place: Float, discs: Float) -> tuple[Float, float]:
-        """Return ``discs`` with a further disc near ``place``, and the gain in evidence."""
+        """Return ``discs`` with a further disc near ``place``, and the resulting gain in evidence."""
         p, before = self._p, self.evidence
         self._include(place[None])
         if not len(discs):

@@ -1,9 +1,9 @@
 """Soft load discs: variance, evidence and search.
 
 A cell has four loads: two shear loads and a normal load on a half-space, and a normal load on a thin bonded
-layer. The layer load moves the skin only near the cell, and represents all displacements that no load on a
-half-space can cause. A disc d has a centre (row, column) and a radius R in cells, an amplitude a in units of
-the prior's loads, and a layer share β. It adds the variance a² w to the half-space loads of each cell, and
+layer. The layer load moves the skin only near the cell, and represents all displacements that loads on a
+half-space cannot cause. A disc d has a centre (row, column) and a radius R in cells, an amplitude a in units
+of the prior's loads, and a layer share β. It adds the variance a² w to the half-space loads of each cell, and
 a² β² w to the layer load, where
 
     w = 1 / (1 + exp((r − R − ¼) / ¼)),   r: distance of the cell from the centre
@@ -93,7 +93,7 @@ def make_scratch(cells: int) -> Scratch:
 
 @njit
 def add_variance(discs: Float, place: Float, variance: Float) -> None:
-    """Write the variances of the half-space and layer loads (2, n) at the cells ``place`` (n, 2)."""
+    """Write the variances (2, n) of the half-space loads and the layer load at the cells ``place`` (n, 2)."""
     for cell in range(place.shape[0]):
         total, layer = 0.0, 0.0
         for d in range(discs.shape[0]):

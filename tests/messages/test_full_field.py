@@ -95,6 +95,13 @@ def assert_same(got: object, wanted: object) -> None:
         assert (got, type(got)) == (wanted, type(wanted))
 
 
+def test_the_full_field_tries_every_value() -> None:
+    """A value that is added to a field and left out here would be lost unnoticed."""
+    for entry in dataclasses.fields(FieldFrame):
+        value = getattr(full(1), entry.name)
+        assert isinstance(value, np.ndarray) or value != entry.default, entry.name
+
+
 @pytest.mark.parametrize("field", [full(1), full(2), bare()], ids=["full", "other", "bare"])
 def test_a_field_arrives_bit_for_bit(field: FieldFrame) -> None:
     got, sent = decode_field(encode_field(field, SENT))

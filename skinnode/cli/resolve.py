@@ -184,6 +184,6 @@ def _print(results: Sequence[dict[str, Any]]) -> None:
         )
     out = console()
     out.print(shown)
-    told = [(kind[:-1], text) for kind in ("notes", "faults") for each in results for text in each[kind]]
-    for kind, text in dict.fromkeys(told):
+    found = [(kind[:-1], text) for kind in ("notes", "faults") for each in results for text in each[kind]]
+    for kind, text in dict.fromkeys(found):
         out.print(f"{kind}: {text}", soft_wrap=True)

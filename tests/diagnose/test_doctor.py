@@ -75,6 +75,8 @@ def test_a_healthy_hand(hand_file: HandFile, on: On) -> None:
 
 def test_a_running_hand_is_judged_and_not_disturbed(hand_file: HandFile, on: On) -> None:
     file = hand_file()
+    with file.open("a") as text:  # a machine that stands still for half a second loses no node
+        text.write("[bring_up]\nheartbeat_ms = 500\n")
     hand = load_hand(file)
     on(Fleet(hand))
     host = on(Host.from_config(hand))

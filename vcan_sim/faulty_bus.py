@@ -62,7 +62,7 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 
 
 class FaultyBus:
-    """Bus of a simulated hand, with its faults and their counts.
+    """Bus of a simulated hand, including injected faults and their counts.
 
     Args:
         config: Configuration of the bus.

@@ -4,7 +4,7 @@ While the patch is touched, the gains drift, so the expected readings at rest be
 touch therefore ends in one of four ways:
 
 - the readings agree with the values that were expected at rest when the touch began;
-- the readings have changed towards rest, and agree with the rest values within the drift since the onset;
+- the readings have moved back towards rest, and agree with the rest values within the drift since the onset;
 - a small fraction of the touch remains and stays constant, because the rubber creeps;
 - the readings have agreed with the rest values, within the drift, for half an hour.
 

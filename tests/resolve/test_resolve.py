@@ -1,4 +1,4 @@
-"""Recordings solved again: the bytes of the serial road, whoever solves and whoever dies."""
+"""Recordings solved again: the same bytes as a serial run, with any workers, also if some are killed."""
 
 from __future__ import annotations
 

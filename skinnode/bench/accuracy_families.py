@@ -38,7 +38,10 @@ WRONG_MOST: Final = 0.01
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one scene. Sums and counts are pairs: for moved coordinates, and for coordinates at rest."""
+    """Result of one scene.
+
+    Sums and counts are pairs: one value for moved coordinates, and one for coordinates at rest.
+    """
 
     family: str
     layout: tuple[str, float]
@@ -58,7 +61,7 @@ class Sample:
     worst: float
     """Largest error, in standard deviations."""
     contacts: tuple[int, int]
-    """Numbers of contacts found and of loads."""
+    """Number of contacts found, and number of loads."""
     force: tuple[float, float]
     """Error of the total normal force, and its standard deviation, N; NaN if unknown or if there are no
     contacts."""
@@ -70,7 +73,7 @@ class Sample:
 
 
 def sample(scene: Scene, field: FieldFrame, **case: Any) -> Sample:
-    """Compare a field with the truth of a scene; ``case`` contains the other fields of the sample."""
+    """Compare a field with the truth of a scene; ``case`` contains the sample's other attributes."""
     truth = scene.truth_m
     error, claim = field.displacement_m - truth, (field.half_width_95_m / Z_95_TWO_SIDED) ** 2
     moved = np.abs(truth) >= MOVED * np.abs(truth).max()
@@ -106,7 +109,10 @@ def _pair(values: Iterable[Any]) -> tuple[Any, Any]:
 
 
 def row(samples: list[Sample]) -> dict[str, Any]:
-    """Return the statistics of several scenes. Scenes that did not converge enter only counts and time."""
+    """Return the statistics of several scenes.
+
+    Scenes that did not converge are included only in the counts and the time.
+    """
     kept = [each for each in samples if each.converged]
     square, claim, inside, count = (
         np.array([getattr(each, name) for each in kept], np.float64).reshape(-1, 2)
@@ -200,7 +206,7 @@ def _solve(prior: str, layout: tuple[str, float], sigma: float, scenes: int) -> 
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement for the prior with discs: name, value, limit, and whether it is met."""
+    """Return one row per requirement for the prior with discs: name, value, limit and verdict."""
     found = []
     for each in figures["families"]:
         if each["prior"] != "discs":
@@ -228,7 +234,7 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
-    """Print the tables of the families."""
+    """Print the tables for all families."""
     echo("\nloads that the prior does not expect, one frame from rest; moved: by a tenth of the peak or more")
     head = f"{'error':>8}{'err./claim':>11}{'moved':>7}{'rest':>6}{'in 95 %':>9}{'moved':>7}{'rest':>7}"
     head += f"{'>5 dev.':>9}{'contacts':>9}{'force':>7}{'centre':>7}{'ms':>6}"

@@ -52,17 +52,17 @@ class Scene:
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K) resistances during the press, ohm, excluding the sample at rest."""
+    """(T, U, K), ohm: resistances during the press, excluding the sample at rest."""
     truth_m: Float
-    """(U, N, 3) true displacement at the last sample, metres."""
+    """(U, N, 3), metres: true displacement at the last sample."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` evenly spaced samples of the press, ending with the last."""
+        """Return ``samples`` evenly spaced samples of the press, ending with its last sample."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the norm of a displacement's error (U, N, 3), relative to that of the true displacement."""
+        """Return the norm of a displacement's (U, N, 3) error, relative to the true displacement's norm."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
@@ -79,7 +79,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Time up to seven calls; return the shortest time (µs), which other programs have affected least."""
+    """Time up to seven calls; return the shortest time (µs), which other programs affected least."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()

@@ -243,7 +243,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Check the requirements for each hand with at least four buses and with touched patches."""
+    """Check the requirements for each hand with at least four buses and touched patches."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:
@@ -305,7 +305,7 @@ def _settle(host: Host) -> None:
 
 
 def _cpu_s() -> dict[str, float]:
-    """Return the CPU time of each thread group in this process, s."""
+    """Return the CPU time of each thread group in this process, in seconds."""
     used: dict[str, float] = defaultdict(float)
     names = {thread.native_id: thread.name.split()[0] for thread in threading.enumerate()}
     for task in os.listdir("/proc/self/task"):

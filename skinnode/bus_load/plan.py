@@ -36,7 +36,8 @@ PACE_JITTER_S: Final = 0.2e-3
 """Maximum deviation of a chunk from its scheduled time, s, as specified for an otherwise idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of random frames from which the mean frame length is estimated, to a standard error of 0.1 bits."""
+"""Number of random frames from which the mean frame length is estimated, with a standard error of 0.1
+bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ class ScanTime:
     node_id: int
     chunks: int
     paced_s: float
-    """Nominal time from the first to the last chunk, s, set by the inhibit time."""
+    """Nominal time from the first to the last chunk, s; determined by the inhibit time."""
     worst_s: float | None
     """Worst-case time from queueing the SYNC to the end of the summary, s; None if unbounded."""
 
@@ -185,7 +186,7 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Plan the traffic of each bus that has patches, whatever its load.
+    """Plan the traffic of each bus that has patches, regardless of its load.
 
     Args:
         hand: the hand.
@@ -308,7 +309,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Return each identifier's worst-case response time, s; None if unbounded."""
+    """Return each identifier's worst-case response time in seconds; None if unbounded."""
     messages = [
         Message(
             frame.can_id,
@@ -337,8 +338,8 @@ def _scan_time(
 ) -> ScanTime:
     """Compute the nominal and the worst-case duration of a patch's scans.
 
-    The worst case is the nominal duration plus the latency of the node and the response times of SYNC, last
-    chunk and summary.
+    The worst case is the nominal duration plus the latency of the node and the response times of the SYNC,
+    the last chunk and the summary.
     """
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s

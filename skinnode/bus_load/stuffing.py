@@ -1,7 +1,7 @@
 """Counts the bits of many frames, including stuff bits, for :mod:`skinnode.bus_load.timing`.
 
-The compiled kernels are in :mod:`skinnode.bus_load.stuffing_kernels`, which is imported on the first count: a
-node and the simulator of a kernel bus count no bits, and need not load numba.
+The compiled kernels are in :mod:`skinnode.bus_load.stuffing_kernels`, which is imported on first use: a node
+and the simulator of a kernel bus do not count bits, so they need not load numba.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def classic_frame_bits(head: int, data: bytes) -> int:
     Returns:
         Number of bits, including stuff bits and inter-frame space.
     """
-    # The data are passed in two halves, because numba would compile the kernel again for numbers of 2⁶³ or
+    # The data are passed in two halves, because numba would recompile the kernel for numbers of 2⁶³ or
     # more.
     word = int.from_bytes(data, "big")
     return int(_kernels().classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, *_arrays()))

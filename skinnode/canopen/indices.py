@@ -136,7 +136,7 @@ PDO_INVALID: Final = 1 << 31
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of the communication record of a PDO."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Lengths of the data types that can be mapped into an RPDO as dummies, bits, by data type index.
+"""Lengths in bits of the data types that can be mapped into an RPDO as dummies, by data type index.
 
 A node ignores the bytes of a dummy. BOOLEAN is not supported, because mapped objects must consist of whole
 bytes.
@@ -181,12 +181,12 @@ CODES: Final = 0x2100
 """Index of the latest codes of upper wire 0, one code per sub-index. The codes of upper wire r are at index
 CODES + r."""
 BASELINE: Final = 0x2200
-"""Index of the R0 values of upper wire 0, ohm (0 if unknown), one crossing per sub-index. The values of upper
-wire r are at index BASELINE + r."""
+"""Index of the R0 values of upper wire 0, in ohms (0 if unknown), one crossing per sub-index. The values of
+upper wire r are at index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see :mod:`skinnode.protocol.coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""Index of the whole baseline, a DOMAIN: U·K REAL32 values of R0, ohm, ordered by upper wire. It must be
+"""Index of the whole baseline, a DOMAIN: U·K REAL32 values of R0 in ohms, ordered by upper wire. It must be
 written as a whole."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")

@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Value in place of the node-ID of a device without one."""
+"""Value that replaces the node-ID in a device without a node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,

@@ -1,4 +1,4 @@
-"""Options of ``skinnode host`` that publish the hand over Zenoh, and the publication itself."""
+"""Options of ``skinnode host`` for publishing the hand over Zenoh, and the publication itself."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ class Connections(NamedTuple):
 
 
 class AskedPublication:
-    """Publication of a hand, or none.
+    """Publication of a hand; does nothing unless ``options`` are given.
 
     Args:
-        options: Connections; None for no publication.
+        options: Connections; None to publish nothing.
         commands: Whether programs may command the hand.
     """
 
@@ -88,10 +88,10 @@ class AskedPublication:
 
 
 def asked_publication(connections: Connections, *, publish: bool, commands: bool) -> AskedPublication:
-    """Return the publication that the options ask for.
+    """Return the publication requested by the options.
 
     Raises:
-        ConfigError: if an option is invalid or lacks ``--publish``, or a package is missing.
+        ConfigError: if an option is invalid or is given without ``--publish``, or a package is missing.
     """
     from skinnode.errors import ConfigError, Shown
 

@@ -54,7 +54,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
     """Solve one wire with skinnode, SciPy and Ceres, from the same initial guess near the solution.
 
-    Every solver is timed with the loosest tolerance that leads to a displacement error of at most 1e-9.
+    Every solver is timed at the loosest tolerance that yields a displacement error of at most 1e-9.
     """
     from skinnode.bench import solve as bench
 
@@ -135,7 +135,7 @@ def trust(
     hours: Annotated[
         float,
         typer.Option(
-            min=0, help="Simulated time in which to count false alarms, in patch-hours at 100 scans/s."
+            min=0, help="Simulated time over which to count false alarms, in patch-hours at 100 scans/s."
         ),
     ] = 0.1,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve scans in parallel.")] = 1,
@@ -201,10 +201,10 @@ def accuracy(
 ) -> None:
     """Measure the displacement error as a function of solve time, noise and code width.
 
-    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
-    `--only detection`, it measures which touches the detector finds, how soon, and its false alarms. The exit
-    status is 1 if a requirement is not met. No requirement limits a time, because times depend on the
-    machine.
+    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With `--only
+    detection`, it measures which touches the detector finds, how soon it finds them, and how many false
+    alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time, because
+    times depend on the machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)
@@ -214,7 +214,7 @@ def accuracy(
     _prepare(json, plot)
     if only == "families":
         if plot is not None:
-            raise typer.BadParameter("got --plot, which --only families does not draw", param_hint="--plot")
+            raise typer.BadParameter("got --plot, which --only families does not support", param_hint="--plot")
         figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
     else:
         figures = bench.run(scenes, rounds)
@@ -286,15 +286,15 @@ def scale(
         typer.Option(
             min=0.0,
             max=3600.0,
-            help="Duration of each measurement in real time on udp_multicast, s; 0 to leave them out.",
+            help="Duration of each measurement in real time on udp_multicast, s; 0 to skip them.",
             metavar="S",
         ),
     ] = 10.0,
 ) -> None:
-    """Measure how the CPU time and the memory of simulator and host grow with skin area and touched area.
+    """Measure how the CPU time and memory of the simulator and host grow with skin area and touched area.
 
     Hands run in virtual time, except for the measurements on udp_multicast. By default, the largest hand has
-    1,000 patches, which takes several minutes.
+    1,000 patches, and the benchmark takes several minutes.
     """
     from skinnode.bench import real_time as multicast
     from skinnode.bench import scale as bench
@@ -332,7 +332,7 @@ def scale(
 
 
 def _print_real_time(figures: dict[str, Any]) -> None:
-    """Print the measurements of the simulator in real time."""
+    """Print the real-time measurements of the simulator."""
     for row in figures["rows"]:
         scans = row["scans"] + row["skipped"]
         typer.echo(
@@ -364,8 +364,8 @@ def node(
 ) -> None:
     """Measure the timing accuracy and the CPU cost of a node.
 
-    Covers the pacing of chunks, the time from SYNC to the first chunk, the heartbeat on a full bus, and the
-    time in µs to handle each kind of frame.
+    The benchmark covers the pacing of chunks, the time from SYNC to the first chunk, the heartbeat on a full
+    bus, and the time in µs to handle each kind of frame.
     """
     from skinnode.bench import node as bench
 
@@ -436,13 +436,13 @@ def pipeline(
 @app.command()
 def recording(
     json: JsonFile = None,
-    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of full buses, four patches each.")] = 4,
+    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of fully loaded buses with four patches each.")] = 4,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of each recording in minutes.")] = 1.0,
     block: Annotated[
         float, typer.Option(min=1, help="Duration of the simulated traffic, which is repeated, s.")
     ] = 5.0,
 ) -> None:
-    """Write recordings of fully loaded buses; measure size, write cost and seek time of an MCAP file."""
+    """Write recordings of fully loaded buses; measure their size and write cost, and MCAP seek time."""
     from skinnode.bench import recording as bench
     from skinnode.messages.typestore import require_mcap
 
@@ -477,13 +477,13 @@ def remote(
     json: JsonFile = None,
     seconds: Annotated[float, typer.Option(min=1, help="Duration, s.")] = 60.0,
     publish_only: Annotated[
-        bool, typer.Option("--publish-only", help="Run no second process and no ping; measure the host.")
+        bool, typer.Option("--publish-only", help="Measure only the host, without a second process and pings.")
     ] = False,
 ) -> None:
     """Run a host with sixteen patches and a program in a second process; measure losses and latency.
 
-    At the same time, two more processes exchange pings of the size of a field over Zenoh. The exit status is
-    1 if a field was lost. The measured times do not affect the exit status.
+    At the same time, two more processes exchange field-sized pings over Zenoh. The exit status is 1 if a
+    field was lost. The measured times do not affect the exit status.
     """
     from skinnode.bench import remote as bench
     from skinnode.remote.session import require_zenoh
@@ -514,8 +514,8 @@ def soak(
 
     CAN frames of every kind are dropped, other processes occupy the processors, and the kernel cache is
     damaged at the start. The host must keep running, every patch must recover, all frame counts must add up,
-    and memory, threads and file descriptors must not grow. The exit status is 1 if any of these requirements
-    is not met.
+    and memory use and the numbers of threads and file descriptors must not grow. The exit status is 1 if any
+    of these requirements is not met.
     """
     from skinnode.bench import soak as bench
 

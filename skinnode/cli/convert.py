@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _RRD = ".rrd"
 _EXAGGERATION = 10.0
-"""Factor by which displacements are drawn enlarged, as in ``skinnode view``."""
+"""Factor by which displacements are enlarged in drawings, as in ``skinnode view``."""
 
 
 def convert(
@@ -80,7 +80,7 @@ def convert(
 
 
 def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
-    """Draw a recording to a file of Rerun."""
+    """Draw a recording and save the drawing as a Rerun file."""
     from skinnode.errors import ConfigError
     from skinnode.record.convert import Conversion
     from skinnode.view.file_conversion import convert_to_file
@@ -96,5 +96,5 @@ def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
     except BaseException:
         target.unlink(missing_ok=True)
         raise
-    lost = f"{target.name} cannot contain frames and the journal; a recording cannot be made from it again"
+    lost = f"{target.name} cannot contain frames and the journal; it cannot be converted back to a recording"
     return Conversion(0, done.counts.drawn, tuple(done.replay.flaws), (*done.replay.notes, lost))

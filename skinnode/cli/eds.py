@@ -104,7 +104,7 @@ def eds(
 
 
 def _refuse_with_kit(others: dict[str, object]) -> None:
-    """Refuse options that have no effect with --c. ``others``: their values, None if not given."""
+    """Refuse options that have no effect with --c; ``others`` contains their values, None if not given."""
     from skinnode.errors import ConfigError
 
     for option, value in others.items():
@@ -113,7 +113,7 @@ def _refuse_with_kit(others: dict[str, object]) -> None:
 
 
 def _write_kit(folder: Path, texts: dict[str, str]) -> None:
-    """Write the files of the C99 kit, and print where."""
+    """Write the files of the C99 kit, and print their names and folder."""
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import write_text
     from skinnode.protocol.c_kit import may_replace
@@ -123,9 +123,9 @@ def _write_kit(folder: Path, texts: dict[str, str]) -> None:
         folder.mkdir(exist_ok=True)
         foreign = next((file for file in files if not may_replace(file)), None)
     except OSError as error:
-        raise ConfigError("--c", str(folder), f"a folder that can be written ({error.strerror})") from error
+        raise ConfigError("--c", str(folder), f"a writable folder ({error.strerror})") from error
     if foreign is not None:
-        raise ConfigError("--c", str(foreign), "no such file, or one that skinnode eds --c has written")
+        raise ConfigError("--c", str(foreign), "no such file, or a file written by skinnode eds --c")
     for file, text in files.items():
         write_text("--c", file, text)
     typer.echo(f"wrote {', '.join(file.name for file in files)} to {folder}")

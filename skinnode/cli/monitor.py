@@ -52,7 +52,7 @@ def monitor(
         bool, typer.Option("--json", help="Print one JSON object per second instead of showing a screen.")
     ] = False,
 ) -> None:
-    """Show a hand on the terminal: depth and shear maps, touches, health, rates, load, events.
+    """Show a hand in the terminal: depth and shear maps, touches, health, rates, load, events.
 
     The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
     patch, z shows only the selected patch, t tares the selected patch, r records, space freezes the picture,

@@ -144,7 +144,7 @@ def _tabulate(recording: OpenRecording, target: Path) -> Conversion:
     kept: deque[ResistanceFrame] = deque()
     run = Replay(recording, solver=lambda facts, hand, now: KeepingSolver(facts, hand, now, kept))
     fields = _write_table(target, recording.lines[0] if recording.lines else "", _rows(run, kept))
-    lost = "frames, journal, health and events; a recording cannot be made from it again"
+    lost = "frames, journal, health and events; it cannot be converted back to a recording"
     if target.suffix == NPZ:
         lost = f"contacts, faults, {lost}"
     return Conversion(0, fields, tuple(run.flaws), (*run.notes, f"{target.name} cannot contain {lost}"))

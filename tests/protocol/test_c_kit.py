@@ -174,8 +174,8 @@ def test_files_of_others_are_not_replaced(
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--c", "/proc/nowhere/x"], "--c: got '/proc/nowhere/x', allowed: a folder that can be written"),
-        (["--c", "/dev/null"], "--c: got '/dev/null', allowed: a folder that can be written"),
+        (["--c", "/proc/nowhere/x"], "--c: got '/proc/nowhere/x', allowed: a writable folder"),
+        (["--c", "/dev/null"], "--c: got '/dev/null', allowed: a writable folder"),
         (["--c", "x", "-o", "y"], "--output: got 'y', allowed: not together with --c"),
         (["--c", "x", "--dcf", "--node-id", "4"], "--dcf: got True, allowed: not together with --c"),
         (["--c", "x", "--upper-wires", "200", "--lower-wires", "200"], "rows × columns: got 40000"),

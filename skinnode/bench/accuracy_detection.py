@@ -71,7 +71,8 @@ def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
     Args:
         seed: Seed of all random numbers.
         presses: Number of presses per load, layout and drift.
-        hours: Observation time for counting the false alarms of one patch at rest at the default rate, h.
+        hours: Time over which the false alarms of one patch at rest are counted at the default rate, in
+            hours.
     """
     figures: dict[str, Any] = {
         "benchmark": "accuracy detection",

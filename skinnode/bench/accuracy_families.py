@@ -63,10 +63,10 @@ class Sample:
     contacts: tuple[int, int]
     """Number of contacts found, and number of loads."""
     force: tuple[float, float]
-    """Error of the total normal force, and its standard deviation, N; NaN if unknown or if there are no
-    contacts."""
+    """Error of the total normal force and its standard deviation, in newtons; NaN if unknown or if there are
+    no contacts."""
     centroid: tuple[float, float]
-    """Distance from contact to load, and its standard deviation, m; NaN unless there is exactly one of
+    """Distance from contact to load and its standard deviation, in metres; NaN unless there is exactly one of
     each."""
     seconds: float
     """Processor time, s."""

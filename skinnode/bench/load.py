@@ -216,7 +216,7 @@ def _node_frames(
 
 
 def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
-    """Return the duration of each frame on the bus, ns."""
+    """Return the duration of each frame on the bus, in ns."""
     ids = np.array([can_id for _, can_id, _, _ in frames])
     lengths = np.array([len(data) for _, _, data, _ in frames])
     durations = np.zeros(len(frames))

@@ -47,7 +47,7 @@ CHANGED_SCANS: Final = 100
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0
-"""Time from bring-up to measurement, s; all presses reach full depth during this time."""
+"""Time from bring-up to measurement in seconds; all presses reach full depth during this time."""
 
 Row = dict[str, Any]
 

@@ -68,7 +68,7 @@ class Punch:
         return share * self.depth_m * moved
 
     def force_n(self, share: float) -> Float:
-        """Return the normal force 2 a E* δ and the shear force, newtons."""
+        """Return the normal force 2 a E* δ and the shear force, in newtons."""
         normal = 2.0 * self.radius_m * RUBBER.contact_modulus_pa * share * self.depth_m
         return normal * np.array([*self.traction_ratio, -1.0])
 
@@ -157,7 +157,7 @@ class Plate:
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change in the plate's depth along x and along y, 1/m."""
+    """Relative change in the plate's depth along x and along y, per metre."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:

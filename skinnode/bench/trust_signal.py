@@ -72,7 +72,7 @@ class Signal:
 
     rng: np.random.Generator
     rest_ohm: Float
-    """(U, K) baseline resistances stored in the node, ohm."""
+    """(U, K), ohm: baseline resistances stored in the node."""
     ohm: Float
     """(T, U, K), ohm: readings."""
     bad: NDArray[np.bool_]
@@ -97,7 +97,7 @@ class CodeStream:
 
     layout: PatchLayout
     baseline_ohm: Float
-    """(U, K) baseline resistances stored in the node, ohm."""
+    """(U, K), ohm: baseline resistances stored in the node."""
     stated_noise: float
     """Relative noise stated in the hand file."""
     ordinary: bool

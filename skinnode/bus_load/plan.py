@@ -30,10 +30,11 @@ SDO_SHARE: Final = 0.01
 """Fraction of the bandwidth reserved for SDO: one request and one response every 27 ms at 1 Mbit/s."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""Maximum delay from SYNC to the first chunk, s, as specified for a node on an otherwise idle machine."""
+"""Maximum delay in seconds from SYNC to the first chunk, specified for an otherwise idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Maximum deviation of a chunk from its scheduled time, s, as specified for an otherwise idle machine."""
+"""Maximum deviation in seconds of a chunk from its scheduled time, specified for an otherwise idle
+machine."""
 
 _SAMPLES: Final = 512
 """Number of random frames from which the mean frame length is estimated, with a standard error of 0.1
@@ -63,7 +64,7 @@ class PlannedFrame:
     scans: bool = False
     """Whether the frames are sent in every SYNC period."""
     response_s: float | None = None
-    """Worst-case response time, from queueing a frame to its last bit, s; None if unbounded."""
+    """Worst-case response time in seconds, from queueing a frame to its last bit; None if unbounded."""
 
     @property
     def frames_per_s(self) -> float:
@@ -89,9 +90,9 @@ class ScanTime:
     node_id: int
     chunks: int
     paced_s: float
-    """Nominal time from the first to the last chunk, s; determined by the inhibit time."""
+    """Nominal time in seconds from the first to the last chunk, determined by the inhibit time."""
     worst_s: float | None
-    """Worst-case time from queueing the SYNC to the end of the summary, s; None if unbounded."""
+    """Worst-case time in seconds from queueing the SYNC to the end of the summary; None if unbounded."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,7 +99,7 @@ ERROR_FIELD: Final = 0x1003
 COB_ID_SYNC: Final = 0x1005
 CYCLE_PERIOD: Final = 0x1006
 SYNC_WINDOW: Final = 0x1007
-"""Index of the synchronous window length, µs."""
+"""Index of the synchronous window length (in µs)."""
 DEVICE_NAME_INDEX: Final = 0x1008
 HARDWARE_VERSION: Final = 0x1009
 SOFTWARE_VERSION: Final = 0x100A
@@ -149,7 +149,7 @@ DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
 PDO_BYTES: Final = 12
-"""Sub-index of the maximum PDO length, bytes; 8 on classic CAN, 64 on CAN FD."""
+"""Sub-index of the maximum PDO length: 8 bytes on classic CAN, 64 bytes on CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
 """Sub-indices of the chunk index and the scan counter. On CAN FD, sub-index 1 is the number of the upper wire

@@ -18,7 +18,7 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates by index in the bit timing table of CiA 301, bit/s. Index 5 is reserved, and index 9 selects
+"""Bit rates in bit/s, by index in the bit timing table of CiA 301. Index 5 is reserved, and index 9 selects
 automatic bit rate detection."""
 
 LSS_DONE: Final = 0

@@ -214,7 +214,7 @@ def accuracy(
     _prepare(json, plot)
     if only == "families":
         if plot is not None:
-            raise typer.BadParameter("got --plot, which --only families does not support", param_hint="--plot")
+            raise typer.BadParameter("got --plot, which --only families cannot draw", param_hint="--plot")
         figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
     else:
         figures = bench.run(scenes, rounds)
@@ -436,7 +436,7 @@ def pipeline(
 @app.command()
 def recording(
     json: JsonFile = None,
-    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of fully loaded buses with four patches each.")] = 4,
+    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of full buses, four patches each.")] = 4,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of each recording in minutes.")] = 1.0,
     block: Annotated[
         float, typer.Option(min=1, help="Duration of the simulated traffic, which is repeated, s.")
@@ -477,7 +477,7 @@ def remote(
     json: JsonFile = None,
     seconds: Annotated[float, typer.Option(min=1, help="Duration, s.")] = 60.0,
     publish_only: Annotated[
-        bool, typer.Option("--publish-only", help="Measure only the host, without a second process and pings.")
+        bool, typer.Option("--publish-only", help="Measure the host without a second process or pings.")
     ] = False,
 ) -> None:
     """Run a host with sixteen patches and a program in a second process; measure losses and latency.

@@ -117,7 +117,7 @@ def _note_touches(events: EventSubscription, report: Report) -> None:
 
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Collect the fields, and report touches as they happen and values every second, until the end."""
+    """Collect the fields; report touches as they happen, and the host's state every second."""
     from skinnode.cli._run_report import Second
 
     start_s = time.monotonic()

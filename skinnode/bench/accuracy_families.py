@@ -1,7 +1,7 @@
 """Measures the posterior's accuracy for loads that its prior does not expect, with and without discs.
 
 Each scene is one frame, solved from rest. A coordinate counts as moved if it moves by at least a tenth of the
-largest displacement of its scene; all others are at rest. "Error over claim" is the RMS error divided by the
+largest displacement in its scene; all others are at rest. "Error over claim" is the RMS error divided by the
 RMS standard deviation behind the 95 % interval (:attr:`skinnode.FieldFrame.core_std_m`). Deviations are
 errors divided by :attr:`skinnode.FieldFrame.displacement_std_m`, which also accounts for rare large errors.
 """
@@ -28,7 +28,7 @@ from skinnode.solve.posterior.posterior import Posterior
 LAYOUTS: Final = (("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0))
 SIGMAS: Final = (1e-5, 1e-4, 1e-3, 3e-3)
 MOVED: Final = 0.1
-"""Minimum displacement of a moved coordinate, relative to the largest displacement of its scene."""
+"""Minimum displacement of a moved coordinate, relative to the largest displacement in its scene."""
 FAR: Final = 5.0
 """Error, in standard deviations, beyond which a scene counts as wrong."""
 RATIOS: Final = (0.85, 1.1)
@@ -73,7 +73,7 @@ class Sample:
 
 
 def sample(scene: Scene, field: FieldFrame, **case: Any) -> Sample:
-    """Compare a field with the truth of a scene; ``case`` contains the sample's other attributes."""
+    """Compare a field with a scene's ground truth; ``case`` contains the sample's other attributes."""
     truth = scene.truth_m
     error, claim = field.displacement_m - truth, (field.half_width_95_m / Z_95_TWO_SIDED) ** 2
     moved = np.abs(truth) >= MOVED * np.abs(truth).max()

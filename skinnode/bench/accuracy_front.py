@@ -2,10 +2,10 @@
 
 All solvers call the same compiled functions for the potential F and its Jacobian J. The samples are
 noise-free, and every solver starts from rest. Only the four middle upper wires are solved, where the press is
-deepest. Some runs solve only the last sample. Other runs solve a sequence of samples, each from the solution
-of the previous one, as in the paper (:mod:`skinnode.bench.path`). Each solver is run with several tolerances,
-and each run yields one data point. Only the time of ``solve_path`` includes setting up the patch, following
-the path and estimating the error.
+deepest. Some runs solve only the last sample. Other runs solve a sequence of samples, each starting from the
+solution of the previous sample, as in the paper (:mod:`skinnode.bench.path`). Each solver is run with several
+tolerances, and each run yields one data point. Only the times for ``solve_path`` include setting up the
+patch, following the path and estimating the error.
 """
 
 from __future__ import annotations

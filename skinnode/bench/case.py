@@ -22,7 +22,7 @@ STRIDE: Final = 4
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
 """Relative error of the predicted resistance change ΔR that the solver assumes in case 13. The wrong models
-of this case predicted ‖ΔR‖ with an error of 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
+in this case predicted ‖ΔR‖ with an error of 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
 
 
 @dataclass(frozen=True, eq=False)

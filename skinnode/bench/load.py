@@ -138,7 +138,7 @@ class Stream:
     """Frames on one bus with their simulated times."""
 
     t_ns: list[int]
-    """End times of the frames, ns after the first SYNC, in ascending order."""
+    """End times of the frames in ns after the first SYNC, in ascending order."""
     packets: list[bytes]
     load: float
 

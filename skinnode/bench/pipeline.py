@@ -229,7 +229,7 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the number of frames, chunks and scans lost on the way from the generator to the solver."""
+    """Return the number of frames, chunks and scans lost between the generator and the solver."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 

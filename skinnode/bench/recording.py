@@ -171,7 +171,7 @@ def _steps(block: Block) -> list[tuple[list[tuple[str, Frame]], list[FieldFrame]
 
 
 def seek_times(path: Path, topic: str) -> dict[str, float]:
-    """Measure how long mcap's reader takes to open a file and to find the first message after random times.
+    """Measure how long mcap's reader takes to open a file and to find the first message after a random time.
 
     Args:
         path: The file.

@@ -1,11 +1,11 @@
-"""Measures how the CPU time and the memory of simulator and host grow with skin area and contacts.
+"""Measures how CPU time and memory of the simulator and host grow with skin area and number of contacts.
 
 A simulated hand has four patches per bus, and spheres press on some of its patches. The hands run in virtual
 time, so that every patch sends every scan even on a slow machine. The simulated buses take the duration of
-each frame into account. CPU time is read from the CPU clock of each thread: node threads count as simulator,
-all other threads as host. A bus has no thread of its own. When all threads wait, the last one to wait
-simulates the bus. The CPU time of the bus is measured separately and subtracted from that of the thread that
-simulated it.
+each frame into account. CPU time is read from the CPU clock of each thread: node threads count towards the
+simulator, all other threads towards the host. A bus has no thread of its own. When all threads wait, the last
+one to wait simulates the bus. The CPU time of the bus is measured separately and subtracted from that of the
+thread that simulated it.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ InPlace = Callable[[Signal], None]
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault, at a random location and time in each stream."""
+    """A fault that occurs at a random location and time in each stream."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None

@@ -91,7 +91,7 @@ class Ridge:
         return self.half_width_m * np.cos(step), weight / weight.sum()
 
     def _unit(self, points_m: Float) -> Float:
-        """Return the (P, 3, 3) displacements per force, in m/N, from Boussinesq's and Cerruti's solutions."""
+        """Return the (P, 3, 3) compliances in m/N from Boussinesq's and Cerruti's solutions."""
         turn = np.array([[np.cos(self.angle), np.sin(self.angle)], [-np.sin(self.angle), np.cos(self.angle)]])
         along, across = turn @ (points_m - self.center_m).T
         places, weight = self._lines()
@@ -220,7 +220,7 @@ class Bonded:
 
 
 def surface_m(layout: PatchLayout) -> tuple[Float, Float, Float]:
-    """Return the (P, 2) x and y coordinates of the upper electrodes, their minima and maxima, in metres."""
+    """Return the upper electrodes' (P, 2) x-y positions, and the minima and maxima, in metres."""
     points = layout.upper_m[..., :2].reshape(-1, 2)
     return points, points.min(axis=0), points.max(axis=0)
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 HEAD_BITS: Final = 19  # bits of SOF, 11-bit identifier, RTR, IDE, r0 and 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Number of bits in CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3)."""
+"""Number of bits in the CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space
+(3)."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res and BRS; plus the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5

@@ -2,8 +2,9 @@
 
 In a classic frame, five consecutive equal bits between the start of frame and the end of the CRC sequence are
 followed by a stuff bit of the opposite value. A stuff bit can be the first of the next five equal bits. The
-13-bit tail has no stuff bits; it consists of CRC delimiter, ACK slot, ACK delimiter, 7-bit end of frame and
-3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value 0.
+13-bit tail has no stuff bits; it consists of the CRC delimiter, the ACK slot, the ACK delimiter, the 7-bit
+end of frame and the 3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value
+0.
 
 CRC and stuff bits are looked up in tables, one byte at a time, so leading filler bits pad the head of a frame
 to whole bytes. For the CRC, the filler bits are zeros, which leave the initial value of 0 unchanged. For

@@ -132,7 +132,7 @@ range such as 0x1400 to 0x15FF."""
 PDO_MAPPING_OFFSET: Final = 0x200
 """Offset from the index of a PDO's communication record to that of its mapping record."""
 PDO_INVALID: Final = 1 << 31
-"""Bit in the COB-ID of a PDO that disables the PDO."""
+"""COB-ID bit that disables a PDO."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of the communication record of a PDO."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
@@ -186,8 +186,8 @@ upper wire r are at index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see :mod:`skinnode.protocol.coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""Index of the whole baseline, a DOMAIN: U·K REAL32 values of R0 in ohms, ordered by upper wire. It must be
-written as a whole."""
+"""Index of the whole baseline, a DOMAIN: U·K REAL32 values of R0 in ohms, ordered by upper wire. The baseline
+must be written as a whole."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")

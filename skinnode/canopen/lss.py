@@ -55,7 +55,7 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """States of an LSS slave, with their values in *switch state global*."""
+    """States of an LSS slave, with their values in the service *switch state global*."""
 
     WAITING = 0
     CONFIGURATION = 1

@@ -442,7 +442,7 @@ def recording(
         float, typer.Option(min=1, help="Duration of the simulated traffic, which is repeated, s.")
     ] = 5.0,
 ) -> None:
-    """Write recordings of fully loaded buses; measure their size and write cost, and MCAP seek time."""
+    """Write recordings of fully loaded buses; measure their size, write cost and MCAP seek time."""
     from skinnode.bench import recording as bench
     from skinnode.messages.typestore import require_mcap
 

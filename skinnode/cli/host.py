@@ -49,12 +49,12 @@ def host(
 
     Onsets and releases of touches are reported when they happen. With --json, each patch has `touched`,
     `touch_odds` and `contacts` (null before the first field): centroid, area, normal and shear force with
-    standard deviations, in m, m² and N. With --publish, other processes can use the hand
-    (sk.connect in Python, or ROS 2 by rmw_zenoh). Ctrl-C ends the command and leaves the nodes
-    pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
-    reported errors, or a guest received no SYNC. The exit status is also 1 if a scan was torn or a frame was
-    lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
-    be run, or if a node sent frames whose content does not match their identifier.
+    standard deviations, in m, m² and N. With --publish, other processes can use the hand (sk.connect in
+    Python, or ROS 2 via rmw_zenoh). Ctrl-C ends the command and leaves the nodes pre-operational. The exit
+    status is 1 if a patch was not operational at the end, an interface failed or reported errors, or a guest
+    received no SYNC. The exit status is also 1 if a scan was torn or a frame was lost, unless the node
+    reported that its computer was too slow. The exit status is 2 if the hand could not be run, or if a node
+    sent frames whose content does not match their identifier.
     """
     from skinnode.config import load_hand
 

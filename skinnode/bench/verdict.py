@@ -65,7 +65,7 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that a Gaussian error exceeds ``deviations`` standard deviations in magnitude."""
+    """Return the probability that a Gaussian error exceeds ± ``deviations`` standard deviations."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 

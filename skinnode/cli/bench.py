@@ -188,7 +188,7 @@ def accuracy(
         Literal["detection", "families"] | None,
         typer.Option(
             help="Run only this part: the touch detector, or both priors on families of loads that neither "
-            "expects. For families, --scenes counts the scenes of a family for each layout and noise."
+            "expects. For families, --scenes counts the scenes per family, layout and noise level."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,
@@ -201,9 +201,9 @@ def accuracy(
 ) -> None:
     """Measure the displacement error as a function of solve time, noise and code width.
 
-    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With `--only
-    detection`, it measures which touches the detector finds, how soon it finds them, and how many false
-    alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time, because
+    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
+    `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
+    false alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time, because
     times depend on the machine.
     """
     if only == "detection":
@@ -339,7 +339,7 @@ def _print_real_time(figures: dict[str, Any]) -> None:
             f"simulator in real time on udp_multicast, hop_limit {row['hop_limit']}: "
             f"{row['patches']} patches, {row['touched']} touched, {row['frames_per_s']:.0f} frames/s: "
             f"{row['simulator']:.2f} of a core, {row['skipped']} of {scans} scans skipped; "
-            f"host {row['host']:.2f} of a core, {row['fields']} fields; load of the machine {row['load']:.1f}"
+            f"host {row['host']:.2f} of a core, {row['fields']} fields; machine load {row['load']:.1f}"
         )
     times = figures["frame_us"]
     typer.echo(

@@ -203,8 +203,8 @@ def accuracy(
 
     The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
     `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
-    false alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time, because
-    times depend on the machine.
+    false alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time,
+    because times depend on the machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)

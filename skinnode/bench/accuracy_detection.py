@@ -2,12 +2,13 @@
 
 The readings come from :class:`skinnode.bench.truth.Skin`, an independent forward model with closed-form
 displacements. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, like a finger pad. A *small sphere*
-has a sphere radius of 1.5 to 3.5 pitches. Pressed 2 % deep into a layer of half a pitch, it has a contact
-radius of 0.1 to 0.2 pitches, and changes the readings less than noise does. The column ``signal`` shows the
-norm of the change in the readings, in units of the noise. A detector that knows the load, its place and its
-size in advance needs a signal of 3.6 to find 95 % of the presses within three frames (``REACHABLE``).
+has a sphere radius of 1.5 to 3.5 pitches. Pressed to a depth of 2 % into a layer half a pitch thick, it has a
+contact radius of 0.1 to 0.2 pitches and changes the readings less than the noise does. The column ``signal``
+shows the norm of the change in the readings, in units of the noise. A detector that knows the load, its
+position and its size in advance needs a signal of 3.6 to find 95 % of the presses within three frames
+(``REACHABLE``).
 
-False alarms are counted frame by frame at the output of the detector, while the gains of all wires drift.
+False alarms are counted frame by frame at the detector's output while the gains of all wires drift.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ PITCH_M: Final = 4e-3
 NOISE: Final = 1e-3
 LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
 DRIFTS: Final = ("steady", "walk")
-"""Gain drifts of all wires: a constant rate of 1 % per hour up or down, or random walks with a standard
-deviation of 1 % after one hour."""
+"""Gain drifts applied to all wires: a constant rate of 1 % per hour up or down, or random walks with a
+standard deviation of 1 % after one hour."""
 FAMILIES: Final = (
     ("blunt sphere", 0.01),
     ("blunt sphere", 0.02),
@@ -49,19 +50,19 @@ REQUIRED: Final = (("blunt sphere", 0.02), ("dent", 0.05))
 FOUND: Final = 0.95
 WITHIN: Final = 3
 REACHABLE: Final = 3.6
-"""Signal at which the mean of three frames exceeds 4.6 standard deviations with a probability of 95 %:
-(4.6 + 1.64) / √3. Noise exceeds 4.6 standard deviations in one of 450,000 frames."""
+"""Signal at which the mean of three frames exceeds 4.6 standard deviations with a probability of 95 %: (4.6 +
+1.64) / √3. Noise exceeds 4.6 standard deviations in one frame in 450,000."""
 TAPS: Final = (1, 2, 3)
 """Durations of taps, in scans."""
 RAMPS_S: Final = (1.0, 3.0, 10.0, 30.0, 100.0)
-"""Times that slow presses take to reach full depth, s."""
+"""Times for slow presses to reach full depth, s."""
 HOLD_S: Final = 600.0
 SHIFT_H: Final = 4.0
 """Time between tares while false alarms are counted, h. Without tares, a steady drift of 1 % per hour would
 reduce some gains to zero within 100 hours."""
 DETECTOR_US: Final = 20.0
 STREAM: Final = (50.0, 99.0, 99.9, 100.0)
-"""Percentiles of the CPU time per frame in a stream of 4,000 frames with eight touches."""
+"""Reported percentiles of the CPU time per frame in a stream of 4,000 frames with eight touches."""
 
 
 def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
@@ -70,7 +71,8 @@ def run(seed: int, presses: int, hours: float) -> dict[str, Any]:
     Args:
         seed: Seed of all random numbers.
         presses: Number of presses per load, layout and drift.
-        hours: Time for which one patch at rest is observed to count false alarms at the default rate, h.
+        hours: Time over which the false alarms of one patch at rest are counted at the default rate, in
+            hours.
     """
     figures: dict[str, Any] = {
         "benchmark": "accuracy detection",
@@ -159,7 +161,7 @@ def taps(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def slow(seed: int) -> list[dict[str, Any]]:
-    """Test at what depth slow presses are found, whether held presses stay touched, and when creep ends."""
+    """Measure when slow presses are found, whether held presses stay touched, and when creep ends."""
     rows: list[dict[str, Any]] = []
     for depth in (0.02, 0.05, 0.1):
         for seconds in RAMPS_S:
@@ -212,7 +214,7 @@ def slow(seed: int) -> list[dict[str, Any]]:
 
 
 def alarms(seed: int, hours: float) -> list[dict[str, Any]]:
-    """Count false alarms at rest, at the default rate and at a rate that is high enough to reveal errors."""
+    """Count false alarms at rest, at the default rate and at a rate high enough to reveal errors."""
     rows = []
     wanted = [(NOISE, drift, FALSE_ALARMS_PER_HOUR, hours) for drift in DRIFTS]
     wanted += [

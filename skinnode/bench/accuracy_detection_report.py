@@ -29,19 +29,19 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
                 f"  creep of 10 % of a 30 % press, time constant {row['constant_s']:g} s, noise "
                 f"{row['noise']:.0e}: touched for {row['touched_s']:.1f} s, {row['new_onsets']} new onsets"
             )
-    echo("\nfalse alarms of the detector at rest")
+    echo("\nthe detector's false alarms at rest")
     for row in figures["alarms"]:
         echo(
             f"  noise {row['noise']:.0e}, {row['drift']:6} drift: {row['alarms']:4} in {row['hours']:g} h,"
-            f" {row['per_hour']:.2g} an hour, set {row['set_per_hour']:g} ({row['cpu_s']:.0f} s of CPU time)"
+            f" {row['per_hour']:.2g} per hour, set to {row['set_per_hour']:g} ({row['cpu_s']:.0f} s CPU time)"
         )
     time = figures["time"]
     echo(
-        f"\nCPU time of a frame at rest, in the fastest of 31 rounds: {time['median_us']:.1f} µs (median), "
+        f"\nCPU time per frame at rest, fastest of 31 rounds: {time['median_us']:.1f} µs (median), "
         f"{time['mean_us']:.1f} µs (mean); mean in the median round {time['median_of_rounds_us']:.1f} µs"
     )
     stream = ", ".join(f"{share:g} %: {each:.0f} µs" for share, each in time["stream_us"].items())
-    echo(f"CPU time of a frame in a stream with touches, percentiles: {stream}")
+    echo(f"CPU time per frame in a stream with touches, percentiles: {stream}")
     echo("\nrequirements")
     for row in figures["must"]:
         reached = "reached" if row["reached"] else "NOT REACHED"
@@ -51,7 +51,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 def _print_found(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
     echo(
         f"\npresses found within 1, 2, 3 and 4 frames; noise {NOISE:.0e}, {FALSE_ALARMS_PER_HOUR:g} false "
-        "alarms an hour, all gains drift 1 % an hour"
+        "alarms per hour, all gains drift by 1 % per hour"
     )
     frames = "".join(f"{n:6}" for n in range(1, 5))
     echo(f"  {'layout':16}{'drift':8}{'load':14}{'depth':>6}{'signal':>8}{frames}{'release':>9}")

@@ -1,7 +1,7 @@
 """Measures the posterior's accuracy for loads that its prior does not expect, with and without discs.
 
 Each scene is one frame, solved from rest. A coordinate counts as moved if it moves by at least a tenth of the
-largest displacement of its scene; all others are at rest. "Error over claim" is the RMS error divided by the
+largest displacement in its scene; all others are at rest. "Error over claim" is the RMS error divided by the
 RMS standard deviation behind the 95 % interval (:attr:`skinnode.FieldFrame.core_std_m`). Deviations are
 errors divided by :attr:`skinnode.FieldFrame.displacement_std_m`, which also accounts for rare large errors.
 """
@@ -28,7 +28,7 @@ from skinnode.solve.posterior.posterior import Posterior
 LAYOUTS: Final = (("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0))
 SIGMAS: Final = (1e-5, 1e-4, 1e-3, 3e-3)
 MOVED: Final = 0.1
-"""Minimum displacement of a moved coordinate, relative to the largest displacement of its scene."""
+"""Minimum displacement of a moved coordinate, relative to the largest displacement in its scene."""
 FAR: Final = 5.0
 """Error, in standard deviations, beyond which a scene counts as wrong."""
 RATIOS: Final = (0.85, 1.1)
@@ -38,7 +38,10 @@ WRONG_MOST: Final = 0.01
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one scene. Sums and counts are pairs: for moved coordinates, and for coordinates at rest."""
+    """Result of one scene.
+
+    Sums and counts are pairs: one value for moved coordinates, and one for coordinates at rest.
+    """
 
     family: str
     layout: tuple[str, float]
@@ -58,19 +61,19 @@ class Sample:
     worst: float
     """Largest error, in standard deviations."""
     contacts: tuple[int, int]
-    """Numbers of contacts found and of loads."""
+    """Number of contacts found, and number of loads."""
     force: tuple[float, float]
-    """Error of the total normal force, and its standard deviation, N; NaN if unknown or if there are no
-    contacts."""
+    """Error of the total normal force and its standard deviation, in newtons; NaN if unknown or if there are
+    no contacts."""
     centroid: tuple[float, float]
-    """Distance from contact to load, and its standard deviation, m; NaN unless there is exactly one of
+    """Distance from contact to load and its standard deviation, in metres; NaN unless there is exactly one of
     each."""
     seconds: float
     """Processor time, s."""
 
 
 def sample(scene: Scene, field: FieldFrame, **case: Any) -> Sample:
-    """Compare a field with the truth of a scene; ``case`` contains the other fields of the sample."""
+    """Compare a field with a scene's ground truth; ``case`` contains the sample's other attributes."""
     truth = scene.truth_m
     error, claim = field.displacement_m - truth, (field.half_width_95_m / Z_95_TWO_SIDED) ** 2
     moved = np.abs(truth) >= MOVED * np.abs(truth).max()
@@ -106,7 +109,10 @@ def _pair(values: Iterable[Any]) -> tuple[Any, Any]:
 
 
 def row(samples: list[Sample]) -> dict[str, Any]:
-    """Return the statistics of several scenes. Scenes that did not converge enter only counts and time."""
+    """Return the statistics of several scenes.
+
+    Scenes that did not converge are included only in the counts and the time.
+    """
     kept = [each for each in samples if each.converged]
     square, claim, inside, count = (
         np.array([getattr(each, name) for each in kept], np.float64).reshape(-1, 2)
@@ -200,7 +206,7 @@ def _solve(prior: str, layout: tuple[str, float], sigma: float, scenes: int) -> 
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement for the prior with discs: name, value, limit, and whether it is met."""
+    """Return one row per requirement for the prior with discs: name, value, limit and verdict."""
     found = []
     for each in figures["families"]:
         if each["prior"] != "discs":
@@ -228,7 +234,7 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
-    """Print the tables of the families."""
+    """Print the tables for all families."""
     echo("\nloads that the prior does not expect, one frame from rest; moved: by a tenth of the peak or more")
     head = f"{'error':>8}{'err./claim':>11}{'moved':>7}{'rest':>6}{'in 95 %':>9}{'moved':>7}{'rest':>7}"
     head += f"{'>5 dev.':>9}{'contacts':>9}{'force':>7}{'centre':>7}{'ms':>6}"

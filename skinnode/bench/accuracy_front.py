@@ -2,10 +2,10 @@
 
 All solvers call the same compiled functions for the potential F and its Jacobian J. The samples are
 noise-free, and every solver starts from rest. Only the four middle upper wires are solved, where the press is
-deepest. Some runs solve only the last sample. Other runs solve a sequence of samples, each from the solution
-of the previous one, as in the paper (:mod:`skinnode.bench.path`). Each solver is run with several tolerances,
-and each run yields one data point. Only the time of ``solve_path`` includes setting up the patch, following
-the path and estimating the error.
+deepest. Some runs solve only the last sample. Other runs solve a sequence of samples, each starting from the
+solution of the previous sample, as in the paper (:mod:`skinnode.bench.path`). Each solver is run with several
+tolerances, and each run yields one data point. Only the times for ``solve_path`` include setting up the
+patch, following the path and estimating the error.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ class Scene:
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K) resistances during the press, ohm, excluding the sample at rest."""
+    """(T, U, K), ohm: resistances during the press, excluding the sample at rest."""
     truth_m: Float
-    """(U, N, 3) true displacement at the last sample, metres."""
+    """(U, N, 3), metres: true displacement at the last sample."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` evenly spaced samples of the press, ending with the last."""
+        """Return ``samples`` evenly spaced samples of the press, ending with its last sample."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the norm of a displacement's error (U, N, 3), relative to that of the true displacement."""
+        """Return the norm of a displacement's (U, N, 3) error, relative to the true displacement's norm."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
@@ -79,7 +79,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Time up to seven calls; return the shortest time (µs), which other programs have affected least."""
+    """Time up to seven calls; return the shortest time (µs), which other programs affected least."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()

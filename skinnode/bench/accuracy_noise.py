@@ -31,7 +31,7 @@ BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
 PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST: Final = 1000
-"""Minimum number of coordinates from which a 99.9 % quantile is estimated."""
+"""Minimum number of coordinates needed to estimate a 99.9 % quantile."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 PROTOTYPE: Final = {
@@ -64,7 +64,7 @@ class Pool:
     _size: float = 0.0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene's last frame and its true displacement ``truth_m`` (U, N, 3)."""
+        """Add a scene's last frame and its (U, N, 3) true displacement ``truth_m``."""
         used = np.array([status is Status.CONVERGED for status in frame.status])
         error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
         self.scenes += 1
@@ -98,7 +98,7 @@ class Parts:
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene, unless all wires are held; ``truth_m`` is the true displacement (U, N, 3), metres."""
+        """Add a scene, unless all wires are held; ``truth_m`` is the (U, N, 3) true displacement, metres."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])

@@ -28,8 +28,8 @@ class Cycle:
 
     Args:
         solver: Solver to measure.
-        frames: Resistances (T, U, K) of the press, ohm; the release repeats them in reverse order.
-        valid: Mask (U, K) of the resistances to use; default: all.
+        frames: (T, U, K), ohm: resistances during the press; the release repeats them in reverse order.
+        valid: (U, K) bool: True for the resistances to use; default: all.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """Return the resistances (T, U, K) of a press from half to full depth, ohm."""
+    """Return the (T, U, K) resistances in ohms during a press from half to full depth."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 
@@ -59,8 +59,8 @@ def run(rounds: int) -> list[dict[str, Any]]:
 
     The time per frame is the mean over a cycle; the result is the median of all rounds. A press deforms the
     whole half-space and therefore moves every wire. To leave only three wires active, the benchmark masks the
-    readings of all others. The posterior runs with ``hold`` off, so it also solves wires whose readings have
-    not changed.
+    readings of all other wires. The posterior runs with ``hold`` off, so it also solves wires whose readings
+    have not changed.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

@@ -22,7 +22,7 @@ STRIDE: Final = 4
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
 """Relative error of the predicted resistance change ΔR that the solver assumes in case 13. The wrong models
-of this case predicted ‖ΔR‖ with an error of 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
+in this case predicted ‖ΔR‖ with an error of 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +79,9 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
         skin: The patch.
         depth: Depth of the press divided by the layer height.
         converter: Converter that reads the resistances.
-        shares: Depth (T,) in each frame, as a fraction of ``depth``.
+        shares: (T,) depth in each frame, as a fraction of ``depth``.
         spoil: Function that returns a copy of a stream with faulty data; default: no faults.
-        gain: Function that returns factors by which the resistances are multiplied; (T, U, K) or
+        gain: Function that returns the factors by which the resistances are multiplied, (T, U, K) or
             broadcastable to that shape; default: 1.
         presses: Function that returns the presses; default: one random press.
     """

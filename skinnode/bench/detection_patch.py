@@ -70,7 +70,7 @@ class Patch:
     def rest_long(self, frames: int) -> tuple[int, int]:
         """Pass many frames of the untouched patch to the detector.
 
-        The frames are generated in blocks, which takes a tenth of the time that :meth:`see` takes.
+        The frames are generated in blocks, which takes a tenth of the time needed by :meth:`see`.
 
         Args:
             frames: Number of frames.
@@ -89,7 +89,7 @@ class Patch:
         return onsets, untouched
 
     def rest_block(self, frames: int) -> Float:
-        """Return the untouched patch's resistances (frames, U, K) in the next frames, ohm."""
+        """Return the untouched patch's (frames, U, K) resistances in the next frames, in ohms."""
         errors = []
         for gains, rates in ((self._upper, self._rates[0]), (self._lower, self._rates[1])):
             steps = np.zeros((frames, *gains.shape))
@@ -116,12 +116,12 @@ class Patch:
             self.rest(1500)
 
     def pressed_ohm(self, load: Load, share: float = 1.0) -> Float:
-        """Return the resistances (U, K) under a load."""
+        """Return the (U, K) resistances under a load."""
         return self.skin.resistance_ohm(self.skin.displacement_m((load,), share))
 
 
 def load_of(kind: str, depth: float, layout: PatchLayout, rng: np.random.Generator) -> Load:
-    """Return a random load of a kind in :data:`skinnode.bench.accuracy_detection.FAMILIES`.
+    """Return a random load of one of the kinds in :data:`skinnode.bench.accuracy_detection.FAMILIES`.
 
     Args:
         kind: Kind of the load.

@@ -42,11 +42,11 @@ class Scene:
     """True displacement of a patch under one or two loads."""
 
     truth_m: Float
-    """(U, N, 3) displacement, m."""
+    """(U, N, 3), m: displacement."""
     centers_m: tuple[tuple[float, float], ...]
     """Centre of each load, m."""
     force_n: Float
-    """(3,) total force, N; NaN if unknown."""
+    """(3,), N: total force; NaN if unknown."""
     bonded: bool
     """Whether the skin is a bonded layer of the simulator."""
 
@@ -76,7 +76,7 @@ def draw(
 
 
 def _pair(layout: PatchLayout, rng: np.random.Generator, depth: float | None) -> tuple[Load, Load]:
-    """Return two spheres whose distance is in the range :data:`APART`."""
+    """Return two spheres separated by a distance in the range :data:`APART`."""
     while True:
         first, second = (trust_loads.draw("sphere", layout, rng, depth) for _ in range(2))
         gap = np.subtract(second.center_m, first.center_m)

@@ -2,7 +2,7 @@
 
 The data of case 14 are wrong but not marked invalid. Only wires that are CONVERGED and trusted must be
 accurate. Case 14 is limited to trackers, the only solvers that test their input. A tracker receives
-resistances, not codes, so it cannot recognise a frozen wire by its repeated codes; the host does
+resistances, not codes, so it cannot recognise a frozen wire by its repeated codes; the host can
 (:mod:`skinnode.host.frozen_parts`).
 """
 
@@ -39,7 +39,7 @@ KNOWN: Final = {
 """Pairs of fault and noise level for which a few trusted wires are known to be wrong; ``docs/limits.md``
 gives the reasons."""
 UPPER, LOWER = 1, 2
-"""Axis indices of the upper and lower wires in an array (T, U, K)."""
+"""Axis indices of the upper and lower wires in a (T, U, K) array."""
 
 
 def fault_cases() -> Iterator[Case]:
@@ -108,7 +108,7 @@ def _spoilt(taken: Stream, frames: np.ndarray, valid: np.ndarray | None = None) 
 
 
 def _moved(taken: Stream, skin: Skin) -> np.ndarray:
-    """Return the magnitude (U, K) of the relative resistance change at full depth."""
+    """Return the (U, K) magnitudes of the relative resistance changes at full depth."""
     return np.asarray(np.abs(taken.frames_ohm[8] / skin.rest_ohm - 1.0))
 
 

@@ -64,9 +64,9 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Take the step of :func:`compiled_steps` for one wire, in NumPy; return the new relative residual.
+    """Take the same step as :func:`compiled_steps` for one wire in NumPy; return the new relative residual.
 
-    The Levenberg-Marquardt parameter is fixed; the compiled step searches for it.
+    The Levenberg-Marquardt parameter is fixed, whereas the compiled step searches for it.
     """
     f, jt = wire(x)
     r, j = relative_residual(a, f), (jt * a).T
@@ -118,7 +118,7 @@ def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
 def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
     operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float
 ) -> None:
-    """Take one step for every wire from ``start`` (U, n), with the functions that make up the solver loop.
+    """Take one step for every wire from ``start``, (U, n), with the functions that make up the solver loop.
 
     The loop itself is not timed, because it would compute a second step before checking its step limit.
     """

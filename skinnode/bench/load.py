@@ -36,10 +36,10 @@ from vcan_sim.default_scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Polling interval of the sender, s. On a fully loaded bus, about two frames fall due in each interval.
-Frames that are due together are sent together, as by a USB adapter."""
+"""Polling interval of the sender, s. On a fully loaded bus, about two frames become due in each interval.
+Frames that are due together are sent together, as a USB adapter does."""
 LEAD_S: Final = 0.5
-"""Delay between the call of :meth:`Generator.begin` and the first SYNC, s."""
+"""Delay between the call to :meth:`Generator.begin` and the first SYNC, s."""
 _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
@@ -54,9 +54,9 @@ class Sent:
     frames: dict[str, int]
     """Number of frames sent on each bus, excluding the heartbeats before the replay."""
     bus_load: dict[str, float]
-    """Fraction of the time for which each simulated bus was busy."""
+    """Fraction of the time during which each simulated bus was busy."""
     late_p99_ms: float
-    """99th percentile of the delay from the simulated to the actual time of sending, ms."""
+    """99th percentile of the delay from the simulated to the actual send time, ms."""
     late_max_ms: float
     cpu_s: float
 
@@ -81,7 +81,7 @@ class Generator:
         self._receive()
 
     def send_heartbeats(self, buses: Sequence[str]) -> None:
-        """Start sending the heartbeats of the patches on ``buses``, from which a host detects the patches."""
+        """Start sending the heartbeats of the patches on ``buses``, by which a host detects the patches."""
         self._pipe.send(list(buses))
 
     def begin(self) -> int:
@@ -138,7 +138,7 @@ class Stream:
     """Frames on one bus with their simulated times."""
 
     t_ns: list[int]
-    """End times of the frames, ns after the first SYNC, in ascending order."""
+    """End times of the frames in ns after the first SYNC, in ascending order."""
     packets: list[bytes]
     load: float
 
@@ -216,7 +216,7 @@ def _node_frames(
 
 
 def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
-    """Return the duration of each frame on the bus, ns."""
+    """Return the duration of each frame on the bus, in ns."""
     ids = np.array([can_id for _, can_id, _, _ in frames])
     lengths = np.array([len(data) for _, _, data, _ in frames])
     durations = np.zeros(len(frames))

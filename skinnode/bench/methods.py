@@ -61,7 +61,7 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
     """Create a solver for the case; ``name`` is ``exact``, ``posterior`` or ``auto``."""
-    # Default noise, which every call of ``update`` overrides with the noise of the frame.
+    # Default noise, which every call to ``update`` overrides with the noise of the frame.
     common: dict[str, Any] = {
         "relative_noise": case.converter.relative_std,
         "baseline_ohm": case.skin.rest_ohm,
@@ -95,7 +95,7 @@ def _solved(frames: list[FieldFrame]) -> Solved:
 
 
 def _claimed(frame: FieldFrame) -> NDArray[np.bool_]:
-    """Return a mask (U,) of the wires that are CONVERGED and, if trust was assessed, trusted."""
+    """Return a (U,) mask of the wires that are CONVERGED and, if trust was assessed, trusted."""
     converged = _converged(frame.status)
     return converged if frame.wires_trusted is None else converged & frame.wires_trusted
 

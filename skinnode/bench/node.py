@@ -27,7 +27,7 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Rate of frames with eight data bytes that fully loads a 1 Mbit/s bus, Hz."""
+"""Rate at which frames with eight data bytes fully load a 1 Mbit/s bus, Hz."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
 _BURST_S: Final = 1e-3  # time between bursts, because a thread cannot wake up 8000 times per second
@@ -107,7 +107,7 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
 
 
 def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row:
-    """Return a row that summarises signed deviations from the nominal time, ns."""
+    """Return a row that summarises signed deviations from the nominal time, in ns."""
     late_ms = np.abs(late_ns) / 1e6
     p50, p99, most = np.percentile(late_ms, [50, 99, 100]).tolist() if len(late_ms) else [None] * 3
     spread = {"p50_ms": p50, "p99_ms": p99, "max_ms": most}
@@ -168,9 +168,9 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame, which passes a frame of that kind directly to a node.
+    """Return one function per kind of frame; each passes a frame of its kind directly to a node.
 
-    Like the thread of a :class:`NodeRunner`, each function also queries the node's next deadline.
+    Like a :class:`NodeRunner` thread, each function also queries the node's next deadline.
     """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)

@@ -14,11 +14,11 @@ first-order optimality ‖Jᵀr‖∞ refers to the dimensionless residual r = a
 paper's values come from MATLAB: they are larger by a factor of F² and depend on the unit of length, which the
 paper does not state.
 
-At the paper's press depth of 10 %, our Gauss-Newton solved every experiment on ``aligned``, for layer heights
-h from 0.3 to 1 pitch and any number of steps. For a depth of 10 %, the benchmark therefore uses the hardest
-of these layouts, with h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because Gauss-Newton
-fails there as often as in the paper: in 6 of 10 experiments with 5 steps, in 2 with 10 steps, and in none
-with 20 or more.
+At the paper's press depth of 10 %, our Gauss-Newton solver solved every experiment on ``aligned``, for layer
+heights h from 0.3 to 1 pitch and any number of steps. For a depth of 10 %, the benchmark therefore uses the
+hardest of these layouts, with h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because
+Gauss-Newton fails as often there as in the paper: in 6 of 10 experiments with 5 steps, in 2 with 10 steps,
+and in none with 20 or more.
 """
 
 from __future__ import annotations
@@ -78,9 +78,9 @@ class Experiment:
     layout: PatchLayout
     """Layout of the single wire."""
     samples_ohm: Float
-    """(SAMPLES, 1, K) resistances of the wire, ohm."""
+    """(SAMPLES, 1, K), ohm: resistances of the wire."""
     truth_m: Float
-    """(1, N, 3) true displacement at the last sample, metres."""
+    """(1, N, 3), metres: true displacement at the last sample."""
     patch: PatchLayout
     press: Press
 
@@ -211,7 +211,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself, excluding the cycle search, second attempts and checks."""
+    """Return the rows for the path itself, excluding the cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -221,7 +221,7 @@ def _final(path: PathResult) -> float:
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
-    """Return the mean number of calls in each step except the last (figure 8)."""
+    """Return the mean number of calls for each step except the last (figure 8)."""
     paths = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     return [float(each) for each in np.mean([path.evaluations[: samples - 1, 0] for path in paths], axis=0)]
 
@@ -289,7 +289,7 @@ def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
 
 
 def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Float, Float]:
-    """Return the residual r (K,) of the first wire, and its Jacobian J (K, 3N)."""
+    """Return the (K,) residual r of the first wire, and its (K, 3N) Jacobian J."""
     a = frame_ohm[0] / layout.resistivity_ohm_per_m
     r = a * potential_per_m(layout, upper_m)[0] - 1.0
     return r, jacobian(layout, upper_m)[0].reshape(len(a), -1) * a[:, None] * layout.pitch_m
@@ -298,8 +298,8 @@ def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Floa
 def _ten_steps() -> list[dict[str, Any]]:
     """Measure the time and error of a ten-step path on the layout ``staggered``.
 
-    The first rows solve one wire with each operator; the next row uses our default step control. The last row
-    is the time per wire when the whole patch of ten wires is solved.
+    The first rows are for one wire with each operator; the next row is for our default step control. The last
+    row is the time per wire when the whole patch of ten wires is solved.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]

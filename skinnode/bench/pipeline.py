@@ -229,7 +229,7 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the number of frames, chunks and scans lost on the way from the generator to the solver."""
+    """Return the number of frames, chunks and scans lost between the generator and the solver."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
@@ -243,7 +243,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Check the requirements for each hand with at least four buses and with touched patches."""
+    """Check the requirements for each hand with at least four buses and touched patches."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:
@@ -305,7 +305,7 @@ def _settle(host: Host) -> None:
 
 
 def _cpu_s() -> dict[str, float]:
-    """Return the CPU time of each thread group in this process, s."""
+    """Return the CPU time of each thread group in this process, in seconds."""
     used: dict[str, float] = defaultdict(float)
     names = {thread.native_id: thread.name.split()[0] for thread in threading.enumerate()}
     for task in os.listdir("/proc/self/task"):

@@ -1,4 +1,4 @@
-"""Measures the simulator's CPU time in real time on udp_multicast, and the time to exchange a frame.
+"""Measures a real-time simulator's CPU time on udp_multicast, and the time to exchange a frame.
 
 The simulator and the host run in separate processes, as they do with ``vcan-sim``. The hand has sixteen
 patches on four buses. Spheres press on four patches, and all chunks are sent.
@@ -31,13 +31,13 @@ with 0, frames stay on this machine."""
 _SETTLED_S: Final = 3.0
 """Time between bring-up and measurement, s."""
 _BURST: Final = 16
-"""Number of frames sent at a time when the frame exchange is timed."""
+"""Number of frames sent at a time while frame exchange is timed."""
 
 Row = dict[str, Any]
 
 
 class _Counts(NamedTuple):
-    """Simulator counters, from its start."""
+    """Simulator counters since its start."""
 
     cpu_s: float
     frames: int
@@ -164,7 +164,7 @@ def frame_us() -> dict[str, float]:
     """Measure the time to exchange a frame between two endpoints that both receive it.
 
     Returns:
-        Time per frame, µs: ``python_can`` with python-can, ``port`` with
+        Time per frame in µs: ``python_can`` with python-can, ``port`` with
         :class:`~skinnode.transport.CanPort`.
     """
     one, two = (_multicast_bus("can0", random.randrange(1 << 16), 0) for _ in range(2))

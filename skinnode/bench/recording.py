@@ -1,7 +1,7 @@
 """Measures the size, write cost and seek time of recordings from fully loaded buses.
 
-The frames come from simulated nodes with exact times, and a replay computes the fields from them. A block of
-a few seconds is written repeatedly, with later times, until the recording has the requested length.
+The frames come from simulated nodes and have exact times; a replay computes the fields from the frames. A
+block of a few seconds is written repeatedly, with later times, until the recording has the requested length.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SEEKS: Final = 20
 HOUR_S: Final = 3600.0
 
 _BEGIN_NS: Final = 1_790_000_000_000_000_000
-"""Arbitrary time of the first frame since 1970, ns."""
+"""Arbitrary time of the first frame, ns since 1970."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Block:
     hand: HandConfig
     seconds: float
     frames: list[tuple[str, Frame]]
-    """Bus name and frame, in chronological order; ``t_ns`` counts from the start of the block."""
+    """Pairs of bus name and frame, in chronological order; ``t_ns`` counts from the start of the block."""
     fields: list[FieldFrame]
 
 
@@ -171,7 +171,7 @@ def _steps(block: Block) -> list[tuple[list[tuple[str, Frame]], list[FieldFrame]
 
 
 def seek_times(path: Path, topic: str) -> dict[str, float]:
-    """Measure how long mcap's reader takes to open a file and to find the first message after random times.
+    """Measure how long mcap's reader takes to open a file and to find the first message after a random time.
 
     Args:
         path: The file.

@@ -1,8 +1,8 @@
 """Measures the latency of fields sent to a second process over Zenoh, and of bare Zenoh pings of equal size.
 
-The host is that of :mod:`skinnode.bench.pipeline`: sixteen patches on four CAN FD buses, whose frames a child
-process replays. A second process connects to the hand. At the same time, two more processes exchange messages
-of the size of a field over Zenoh alone, without any skinnode code between sending and receiving.
+As in :mod:`skinnode.bench.pipeline`, the host has sixteen patches on four CAN FD buses, and a child process
+replays their frames. A second process connects to the hand. At the same time, two more processes exchange
+field-sized messages over Zenoh alone, without any skinnode code between sender and receiver.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ROUND_S: Final = 60.0
 TIMES_A_PING: Final = 3.0
 """Maximum ratio of the fields' p99 latency to the pings' p99 latency."""
 PORT: Final = 17647
-"""First port of the benchmark, chosen to avoid other daemons on the machine."""
+"""First port used by the benchmark, chosen to avoid those of other daemons on the machine."""
 PING_PORT: Final = PORT + 16
 _SETTLE_S: Final = 1.0
 
@@ -48,7 +48,7 @@ Row = dict[str, Any]
 
 
 def run(seconds: float, *, publish_only: bool, report: Callable[[Row], None]) -> dict[str, Any]:
-    """Measure in rounds of up to a minute.
+    """Measure latencies in rounds of up to one minute.
 
     Args:
         seconds: Total duration, s.
@@ -154,7 +154,7 @@ def _total(rows: list[Row]) -> Row:
 
 
 def spread(rows: list[Row], key: str) -> dict[str, float]:
-    """Return p50, p99 and the maximum of the times that the rows contain under ``key``."""
+    """Return p50, p99 and the maximum of the times stored under ``key`` in the rows."""
     values = np.concatenate([row[key] for row in rows])
     if not len(values):
         return {}
@@ -166,8 +166,8 @@ def _must(total: Row) -> list[Row]:
     ratio = total["solved_to_program_ms"]["p99"] / total["ping_ms"]["p99"]
     lost = total["lost"] + total["unaccounted"] + total["daemon_dropped"]
     asked = [
-        ("fields lost, by the sequence numbers at both ends", lost, 0.0, False),
-        ("p99 of a field, solved to received by the program, in pings", ratio, TIMES_A_PING, True),
+        ("fields lost, according to the sequence numbers at both ends", lost, 0.0, False),
+        ("p99 of solved to received by the program, relative to a ping", ratio, TIMES_A_PING, True),
     ]
     return [
         {"what": what, "got": got, "asked": most, "reached": got <= most, "time": time}
@@ -176,7 +176,7 @@ def _must(total: Row) -> list[Row]:
 
 
 def _payload_bytes(hand: HandConfig) -> int:
-    """Return the size of the first patch's encoded field, bytes."""
+    """Return the size of the first patch's encoded field, in bytes."""
     from skinnode.solve.tracker import Tracker
 
     layout = hand.patches[0].layout.build()
@@ -218,7 +218,7 @@ def _received(pipe: Connection) -> Any:
     try:
         return pipe.recv()
     except (EOFError, OSError):
-        raise SkinError("a process of the benchmark ended unexpectedly; see its message above") from None
+        raise SkinError("a benchmark process ended unexpectedly; see its message above") from None
 
 
 def line(row: Row) -> str:

@@ -23,7 +23,7 @@ _PING, _PONG = "skinnode-bench/ping", "skinnode-bench/pong"
 
 
 def until_closed(program: Callable[..., None], *arguments: Any) -> None:
-    """Run a function; end quietly if the parent closes the pipe."""
+    """Run a function; exit quietly if the parent closes the pipe."""
     with contextlib.suppress(EOFError, OSError):
         program(*arguments)
 
@@ -61,7 +61,7 @@ def follow(pipe: Connection, hand: str, port: int) -> None:
 
 
 def ping(pipe: Connection, port: int, payload_bytes: int) -> None:
-    """Send a ping every 10 ms and await its echo until the parent sends a message; then send the times."""
+    """Ping every 10 ms, awaiting each echo, until the parent sends a message; then send the times."""
     import zenoh
 
     arrived: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -116,7 +116,7 @@ def _session(settings: dict[str, Any]) -> zenoh.Session:
         "mode": "peer",
         "scouting/multicast/enabled": False,
         "listen/endpoints": [],
-        "connect/timeout_ms": -1,  # the echo may start later
+        "connect/timeout_ms": -1,  # the echo server may start later
         "connect/exit_on_failure": False,
     }
     for key, value in {**fixed, **settings}.items():

@@ -1,11 +1,11 @@
-"""Measures how the CPU time and the memory of simulator and host grow with skin area and contacts.
+"""Measures how CPU time and memory of the simulator and host grow with skin area and number of contacts.
 
 A simulated hand has four patches per bus, and spheres press on some of its patches. The hands run in virtual
-time, so that every patch sends every scan even on a slow machine. The simulated buses take account of the
-duration of each frame. CPU time is read from the CPU clock of each thread: node threads count as simulator,
-all other threads as host. A bus has no thread of its own. When all threads wait, the last one to wait
-simulates the bus. The CPU time of the bus is measured separately and subtracted from that of the thread that
-simulated it.
+time, so that every patch sends every scan even on a slow machine. The simulated buses take the duration of
+each frame into account. CPU time is read from the CPU clock of each thread: node threads count towards the
+simulator, all other threads towards the host. A bus has no thread of its own. When all threads wait, the last
+one to wait simulates the bus. The CPU time of the bus is measured separately and subtracted from that of the
+thread that simulated it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from vcan_sim.virtual_time import VirtualClock
 PATCHES: Final = (1, 4, 16, 64, 256, 1000)
 """Default numbers of patches; in each hand, one patch is touched."""
 MOST_FIELDS: Final = 4_000
-"""Limit on the product of patches and scans per measurement, so that large hands take a few minutes."""
+"""Limit on the product of patches and scans per measurement, so that large hands take only a few minutes."""
 LEAST_SCANS: Final = 2
 """Minimum number of scans per measurement."""
 FIXED: Final = 16
@@ -43,17 +43,17 @@ FIXED: Final = 16
 TOUCHED: Final = (0, 1, 4, 16)
 """Numbers of touched patches in the hand of :data:`FIXED` patches."""
 CHANGED_SCANS: Final = 100
-"""Minimum number of scans of hands that send only changed chunks. Every tenth scan is sent whole."""
+"""Minimum number of scans of hands that send only changed chunks. Every tenth scan is sent in full."""
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0
-"""Time from bring-up to measurement, s, within which all presses reach their full depth."""
+"""Time from bring-up to measurement in seconds; all presses reach full depth during this time."""
 
 Row = dict[str, Any]
 
 
 def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
-    """Measure CPU time against skin area and against the number of touched patches.
+    """Measure CPU time as a function of skin area and of the number of touched patches.
 
     Args:
         patches: Numbers of patches to measure; in each hand, one patch is touched.
@@ -139,8 +139,8 @@ def physics() -> dict[str, float]:
     """Time the simulation of one scan, without the node and its frames.
 
     Returns:
-        ``untouched_us`` and ``touched_us``, the time to compute the resistances of an untouched and of a
-        pressed patch, µs; ``converter_us``, the time to add the noise of the converter, µs.
+        ``untouched_us`` and ``touched_us``, the times in µs to compute the resistances of an untouched and a
+        pressed patch; ``converter_us``, the time in µs to add the converter noise.
     """
     scenes = bind_scene(scene_of(1), hand_of(2))
     patches = {"touched": _Skin(scenes["patch0"]), "untouched": _Skin(scenes["patch1"])}

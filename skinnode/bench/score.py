@@ -25,15 +25,15 @@ EXCESS_LIMIT = 1.15
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
-    """Return the Cramér-Rao bound (U, N, 3) on each coordinate's standard deviation, metres.
+    """Return the (U, N, 3) Cramér-Rao bounds on the coordinates' standard deviations, in metres.
 
     Args:
         layout: The patch.
-        upper_m: Electrode positions (U, N, 3), metres.
-        relative_std: Relative standard deviations (U, K) of the resistances.
+        upper_m: (U, N, 3), metres: electrode positions.
+        relative_std: (U, K) relative standard deviations of the resistances.
 
     Returns:
-        The bound (U, N, 3), metres; inf for wires with a singular Jacobian.
+        (U, N, 3), metres: the bounds; inf for wires with a singular Jacobian.
     """
     potential = potential_per_m(layout, upper_m)
     slopes = jacobian(layout, upper_m).reshape(*layout.shape, layout.unknowns)
@@ -63,7 +63,7 @@ class Score:
     relative_error: float
     """Relative error ‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
     coverage95: float
-    """Fraction of coordinates with an error inside the reported 95 % interval."""
+    """Fraction of coordinates whose error is within the reported 95 % interval."""
     worst_deviations: float
     """Largest error of a coordinate, in reported standard deviations."""
 
@@ -97,7 +97,7 @@ class Scorer:
     _deepest: tuple[float, float] = (0.0, float("nan"))
 
     def add(self, frame: FieldFrame, true_upper_m: Float) -> float:
-        """Compare a scan with the true positions (U, N, 3), metres; return its RMS error, metres."""
+        """Compare a scan with the (U, N, 3) true positions in metres; return its RMS error in metres."""
         truth = true_upper_m - self.layout.upper_m
         error = frame.displacement_m - truth
         rms = float(np.sqrt(np.mean(error**2)))

@@ -1,4 +1,4 @@
-"""Soak test: after random faults, host and patches must recover, and all frame counts must agree.
+"""Soak test: after random faults, the host and patches must recover, and all frame counts must agree.
 
 The host and the simulated nodes run in one process and communicate over two virtual buses. Each round injects
 one to three kinds of fault, such as dropped frames, into one or all patches, while subscribers join and
@@ -61,7 +61,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Minimum number of faults in a round for which the report gives their number, not their names."""
+"""Minimum number of faults in a round for which the report gives their number instead of their names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -345,7 +345,8 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
     """Wait until every patch is operational and has published a field whose SYNC was sent after the call.
 
     Returns:
-        The waiting time, s, and a text that gives the last patch to recover and what it was waiting for.
+        The waiting time in seconds, and a text that names the last patch to recover and what it was waiting
+        for.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 

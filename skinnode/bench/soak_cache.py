@@ -44,7 +44,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage random cache files in ``folder``, alternately by truncation and with random bytes.
+    """Damage random cache files in ``folder``, alternately by truncating and overwriting them.
 
     The choice depends only on the seed and the contents of the folder. Returns one line of text per damaged
     file.

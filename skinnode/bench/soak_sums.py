@@ -39,16 +39,16 @@ class FrameCounter:
             self.sent_on[bus][kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """Nothing to count."""
+        """Count nothing."""
 
     def withheld(self, patch: str) -> None:
-        """Nothing to count."""
+        """Count nothing."""
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """Nothing to count."""
+        """Count nothing."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Nothing to count."""
+        """Count nothing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,12 +45,12 @@ class Case:
         self._jt = np.empty((unknowns, equations))
 
     def residual(self, x: Float) -> Float:
-        """Return the residual r (K,) at x."""
+        """Return the (K,) residual r at x."""
         potential(x, self._lower, self._f)
         return np.asarray(self.a * self._f - 1.0)
 
     def jacobian_transposed(self, x: Float) -> Float:
-        """Return the transposed Jacobian Jᵀ (3N, K) at x."""
+        """Return the (3N, K) transposed Jacobian Jᵀ at x."""
         potential_jacobian(x, self._lower, self._scratch, self._jt)
         return np.asarray(self._jt * self.a)
 
@@ -59,7 +59,7 @@ class Case:
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
-        """Return the Jacobian J (K, 3N) at x."""
+        """Return the (K, 3N) Jacobian J at x."""
         return self.jacobian_transposed(x).T
 
     def error(self, x: Float) -> float:
@@ -68,7 +68,7 @@ class Case:
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """Return the displacement (U, N, 3) of a smooth, sheared dent ``depth`` layer heights deep, metres."""
+    """Return the (U, N, 3) displacement in metres of a smooth, sheared dent ``depth`` layer heights deep."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)

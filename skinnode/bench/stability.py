@@ -1,4 +1,4 @@
-"""Solves every hard case for many seeds, and reports error, uncertainty and verdict of each method."""
+"""Solves every hard case for many seeds, and reports each method's error, uncertainty and verdict."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from skinnode.files.output_file import write_text
 ROUNDS: Final = 31
 """Default number of rounds; odd, so that the median is one of the measured times."""
 TURN_S: Final = 4e-3
-"""Duration of a function's turn, s: long compared with the resolution of the clock, short compared with a
-burst of background load."""
+"""Duration of a function's turn in seconds: long compared with the resolution of the clock, short compared
+with a burst of background load."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Implements ``skinnode bench trust``: tests whether trusted values are right and faults are detected.
+"""Implements ``skinnode bench trust``: tests whether trusted values are correct and faults are detected.
 
 The data of each stream pass through the modules in this order::
 
@@ -46,7 +46,7 @@ SHORT: Final[dict[str, Any]] = {
 }
 """Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans in a stream in which false alarms are counted; it contains ten touches."""
+"""Number of scans in a stream in which false alarms are counted; the stream contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
 """Timeline of a touch in a stream in which false alarms are counted."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
@@ -133,11 +133,11 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
 
 
 class Kept:
-    """File of scores, one line per solved stream, from which an interrupted run is resumed.
+    """Score file with one line per solved stream, from which an interrupted run is resumed.
 
     Args:
         path: File to which scores are appended; None to store nothing.
-        seed: Seed of the run; lines with another seed are ignored.
+        seed: Seed of the run; lines with a different seed are ignored.
     """
 
     def __init__(self, path: Path | None, seed: int) -> None:
@@ -193,7 +193,7 @@ def run(  # noqa: PLR0913 - options of a command
     progress: Callable[[str], object] = lambda line: None,
     kept: Path | None = None,
 ) -> dict[str, Any]:
-    """Solve streams with no, one or two faults and long fault-free streams; check the targets.
+    """Solve streams with zero, one or two faults, and long fault-free streams; check the targets.
 
     Args:
         seed: Seed of all streams.

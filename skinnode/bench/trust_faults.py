@@ -6,7 +6,7 @@ occurs in a real patch:
 made    deviation of the patch from its layout, present when the baseline is measured
 wired   wiring, before the converter adds noise
 read    readings, after the converter has added noise
-sent    codes, on their way to the host
+sent    codes, in transit to the host
 stated  noise or tolerances stated in the hand file
 
 ``Signal.bad`` marks the readings changed by a fault. A fault reported for any other reading is a false alarm.
@@ -30,14 +30,14 @@ CHUNK: Final = 3
 NOISY: Final = 3e-3
 """Relative noise of a wire with a bad contact; the simulator uses the same value."""
 SETTLE: Final = 50
-"""Number of scans at rest within which the host must detect that the hand file states a wrong noise."""
+"""Number of scans at rest within which the host must detect that the hand file states an incorrect noise."""
 
 InPlace = Callable[[Signal], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault, at a random location and time in each stream."""
+    """A fault that occurs at a random location and time in each stream."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None
@@ -50,11 +50,12 @@ class Fault:
     ordinary: bool = False
     """Whether the hand file states ordinary tolerances instead of exact positions."""
     local: bool = False
-    """Whether the fault is confined to single crossings or wires, so that the others can be trusted."""
+    """Whether the fault is confined to individual crossings or wires, so that the others can be trusted."""
     scored_from: int = 0
     """Index of the first scored scan."""
     group: str = ""
-    """Group of mutually exclusive faults to which the fault belongs; empty if it combines with any fault."""
+    """Group of mutually exclusive faults to which the fault belongs; empty if it can be combined with any
+    fault."""
 
 
 # --- places and times
@@ -66,7 +67,7 @@ def _one(signal: Signal, axis: int, many: int = 1) -> int:
 
 
 def _pressed_wire(signal: Signal, axis: int) -> int:
-    """Choose one of the three upper (``axis`` 1) or lower (2) wires whose readings the load changes most."""
+    """Choose one of the three upper (``axis`` 1) or lower (2) wires most affected by the load."""
     middle = (signal.pressed.start + signal.pressed.stop) // 2
     change = np.abs(signal.ohm[middle] / signal.rest_ohm - 1.0).max(axis=2 - axis)
     most = np.argsort(change)[-3:]
@@ -74,7 +75,7 @@ def _pressed_wire(signal: Signal, axis: int) -> int:
 
 
 def _crossing(signal: Signal) -> tuple[int, int]:
-    """Choose one of the 30 crossings whose readings the load changes most."""
+    """Choose one of the 30 crossings most affected by the load."""
     middle = (signal.pressed.start + signal.pressed.stop) // 2
     change = np.abs(signal.ohm[middle] / signal.rest_ohm - 1.0).ravel()
     at = int(signal.rng.choice(np.argsort(change)[-30:]))
@@ -86,7 +87,7 @@ def _at_rest(signal: Signal) -> int:
 
 
 def _pressing(signal: Signal) -> int:
-    """Choose a random scan while the load is being applied."""
+    """Choose a random scan during which the load is being applied."""
     first = max(1, signal.pressed.start - 6)
     return int(signal.rng.integers(first, max(first + 1, signal.pressed.start - 1)))
 
@@ -168,7 +169,7 @@ def _flip(signal: Signal, scans: slice, u: int, k: int, bit: int) -> None:
 
 
 def _flip_once(signal: Signal) -> None:
-    """Flip one bit of one code in one scan, by more than the noise."""
+    """Flip one bit of one code in one scan, which changes the code by more than the noise."""
     t = int(signal.rng.integers(2, signal.shape[0] - 2))
     _flip(signal, slice(t, t + 1), *_crossing(signal), int(signal.rng.integers(6, 16)))
 

@@ -1,9 +1,9 @@
 """Loads for ``skinnode bench trust`` that violate the assumptions of the posterior's prior.
 
-The prior assumes independent loads on the cells of a lattice. The loads of this module have no lattice:
-spheres and flat punches in closed form, line loads at any angle, a dent that no load on a half-space can
-produce, and a rigid plate over the whole patch. The true force is known for bodies that press on a half-space
-or on a layer.
+The prior assumes independent loads on the cells of a lattice. The loads in this module do not lie on a
+lattice: spheres and flat punches in closed form, line loads at any angle, a dent that no load on a half-space
+can produce, and a rigid plate over the whole patch. The true force is known for bodies that press on a
+half-space or on a layer.
 
 The shear traction is proportional to the pressure. The rubber is incompressible (ν = ½). On a half-space,
 pressure therefore causes no tangential displacement, and shear causes no normal displacement.
@@ -68,7 +68,7 @@ class Punch:
         return share * self.depth_m * moved
 
     def force_n(self, share: float) -> Float:
-        """Return the normal force 2 a E* δ and the shear force, newtons."""
+        """Return the normal force 2 a E* δ and the shear force, in newtons."""
         normal = 2.0 * self.radius_m * RUBBER.contact_modulus_pa * share * self.depth_m
         return normal * np.array([*self.traction_ratio, -1.0])
 
@@ -85,13 +85,13 @@ class Ridge:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def _lines(self) -> tuple[Float, Float]:
-        """Return the offset (L,) of each line from the axis, metres, and its fraction (L,) of the load."""
+        """Return the (L,) offsets of the lines from the axis in metres, and their (L,) load fractions."""
         step = np.pi * np.arange(1, LINES + 1) / (LINES + 1)
         weight = np.sin(step) ** 2
         return self.half_width_m * np.cos(step), weight / weight.sum()
 
     def _unit(self, points_m: Float) -> Float:
-        """Return the displacement per force (P, 3, 3), m/N, from Boussinesq's and Cerruti's solutions."""
+        """Return the (P, 3, 3) compliances in m/N from Boussinesq's and Cerruti's solutions."""
         turn = np.array([[np.cos(self.angle), np.sin(self.angle)], [-np.sin(self.angle), np.cos(self.angle)]])
         along, across = turn @ (points_m - self.center_m).T
         places, weight = self._lines()
@@ -118,12 +118,12 @@ class Ridge:
         return total
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,), newtons, that presses the ridge's middle to the required depth."""
+        """Return the (3,) force in newtons that presses the middle of the ridge to the required depth."""
         normal = share * self.depth_m / self._unit(np.array([self.center_m]))[0, 2, 2]
         return np.asarray(normal * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3), metres, due to all line loads."""
+        """Return the (P, 3) displacements due to all line loads, in metres."""
         return np.asarray(self._unit(points_m) @ self.force_n(share))
 
 
@@ -137,7 +137,7 @@ class Dent:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3), metres."""
+        """Return the (P, 3) displacements in metres."""
         offset = (points_m - self.center_m) / self.spread_m
         shape = share * self.depth_m * np.exp(-0.5 * (offset**2).sum(axis=1))
         moved = np.empty((len(points_m), 3))
@@ -157,11 +157,11 @@ class Plate:
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change in the plate's depth along x and along y, 1/m."""
+    """Relative change in the plate's depth along x and along y, per metre."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3), metres, under the plate."""
+        """Return the (P, 3) displacements under the plate, in metres."""
         depth = share * self.depth_m * (1.0 + (points_m - self.center_m) @ np.array(self.tilt))
         return np.asarray(depth[:, None] * np.array([*self.traction_ratio, -1.0]))
 
@@ -188,7 +188,7 @@ class Bonded:
     depth_m: float
 
     def _unit(self, offset_m: Float) -> tuple[Float, Float]:
-        """Return the radial and normal displacements (P,) per peak pressure, m/Pa."""
+        """Return the (P,) radial and normal displacements per unit of peak pressure, in m/Pa."""
         from scipy.special import j0, j1
 
         k = (np.arange(WAVES) + 0.5) * (WAVE_MAX / WAVES) / self.radius_m
@@ -207,7 +207,7 @@ class Bonded:
         return share * self.depth_m / -float(self._unit(np.zeros((1, 2)))[1][0])
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) of the layer's surface, metres."""
+        """Return the (P, 3) displacements of the layer's surface, in metres."""
         offset = points_m - self.center_m
         outwards, up = self._unit(offset)
         r = np.maximum(np.hypot(*offset.T), 1e-12)
@@ -215,12 +215,12 @@ class Bonded:
         return np.asarray(moved * self._peak_pa(share))
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,), newtons; the normal force is ⅔ π a² p₀ (Hertz)."""
+        """Return the (3,) force in newtons; the normal force is ⅔ π a² p₀ (Hertz)."""
         return np.array([0.0, 0.0, -2.0 / 3.0 * math.pi * self.radius_m**2 * self._peak_pa(share)])
 
 
 def surface_m(layout: PatchLayout) -> tuple[Float, Float, Float]:
-    """Return the upper electrodes' (x, y) positions (P, 2), and their minimum and maximum, metres."""
+    """Return the upper electrodes' (P, 2) x-y positions, and the minima and maxima, in metres."""
     points = layout.upper_m[..., :2].reshape(-1, 2)
     return points, points.min(axis=0), points.max(axis=0)
 

@@ -46,11 +46,11 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
     {"crossed_lower": 13},
     {"flipped": 0.2},
 )
-"""Fault of each patch: changed, missing or repeated values. The first patch has none."""
+"""Fault injected into each patch: changed, missing or repeated values. The first patch has no fault."""
 AT_ONCE: Final = 4
 """Number of patches simulated simultaneously by this process."""
 CLEAN_S: Final = 1.2
-"""Time from bring-up to the injection of the faults, s. The first press begins within it."""
+"""Time from bring-up to the injection of the faults, s. The first press begins during this time."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 
@@ -92,7 +92,7 @@ def _together(kinds: tuple[dict[str, Any], ...], seed: int) -> list[dict[str, An
 
 
 def _patch(field: FieldFrame) -> str:
-    assert field.stamp is not None  # the host sets the stamp of every field
+    assert field.stamp is not None  # the host stamps every field
     return field.stamp.patch
 
 

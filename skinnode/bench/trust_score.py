@@ -56,7 +56,7 @@ class Score:
     false_names: int = 0
     """Number of false alarms: faults reported for parts whose readings were correct."""
     touches: int = 0
-    """Number of trusted fields while the load is at full depth or the patch is at rest."""
+    """Number of trusted fields from scans in which the load is at full depth or the patch is at rest."""
     touches_right: int = 0
     """Number of fields counted in ``touches`` with the right number of contacts: one under load, none at
     rest."""
@@ -109,7 +109,7 @@ class Score:
 
 
 def trusted_wires(field: FieldFrame) -> Mask:
-    """Return a mask (U,) of trusted wires; all entries are False if the field is not trusted."""
+    """Return a (U,) mask of trusted wires; all entries are False if the field is not trusted."""
     if not field.trusted:
         return np.zeros(len(field.status), bool)
     if field.wires_trusted is not None:
@@ -118,7 +118,7 @@ def trusted_wires(field: FieldFrame) -> Mask:
 
 
 def deviations(field: FieldFrame, truth_m: Float) -> Float:
-    """Return the errors (U, N, 3) in reported standard deviations; undefined ratios become inf."""
+    """Return the (U, N, 3) errors in reported standard deviations; undefined ratios become inf."""
     with np.errstate(all="ignore"):
         error = np.abs(field.displacement_m - truth_m)
         ratio = np.where(error == 0.0, 0.0, error / field.displacement_std_m)
@@ -126,7 +126,7 @@ def deviations(field: FieldFrame, truth_m: Float) -> Float:
 
 
 def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
-    """Return a mask (U, K) of the readings covered by a reported fault."""
+    """Return a (U, K) mask of the readings covered by a reported fault."""
     mask = np.zeros(shape, bool)
     upper = slice(None) if fault.upper is None else fault.upper
     lower = slice(None) if fault.lower is None else fault.lower
@@ -135,7 +135,7 @@ def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
 
 
 def is_right(fault: DataFault, bad: Mask) -> bool:
-    """Return whether ``bad`` (U, K) marks at least half of the readings covered by ``fault``."""
+    """Return whether the (U, K) mask ``bad`` marks at least half of the readings covered by ``fault``."""
     return bool(bad[covered(fault, bad.shape)].mean() >= 0.5)
 
 

@@ -50,7 +50,7 @@ class Timeline:
 
     @property
     def shares(self) -> Float:
-        """Depth (T,) of the load in each scan, as a fraction of the full depth."""
+        """(T,) depth of the load in each scan, as a fraction of the full depth."""
         ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, self.press + 1) / self.press)
         lift = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, self.release + 1) / self.release)
         held = np.ones(self.hold + self.slide)
@@ -58,7 +58,7 @@ class Timeline:
 
     @property
     def slid(self) -> Float:
-        """Position (T,) of the load in each scan, as a fraction of the total sliding distance."""
+        """(T,) position of the load in each scan, as a fraction of the total sliding distance."""
         way = np.zeros(self.scans)
         start = self.rest + self.press + self.hold
         way[start : start + self.slide] = np.arange(1, self.slide + 1) / max(self.slide, 1)
@@ -72,9 +72,9 @@ class Signal:
 
     rng: np.random.Generator
     rest_ohm: Float
-    """(U, K) baseline resistances stored in the node, ohm."""
+    """(U, K), ohm: baseline resistances stored in the node."""
     ohm: Float
-    """(T, U, K) readings, ohm."""
+    """(T, U, K), ohm: readings."""
     bad: NDArray[np.bool_]
     """(T, U, K) bool: True where a fault changed the reading."""
     pressed: slice
@@ -86,7 +86,7 @@ class Signal:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Numbers of scans, upper wires and lower wires (T, U, K)."""
+        """(T, U, K): numbers of scans, upper wires and lower wires."""
         scans, upper, lower = self.ohm.shape
         return scans, upper, lower
 
@@ -97,7 +97,7 @@ class CodeStream:
 
     layout: PatchLayout
     baseline_ohm: Float
-    """(U, K) baseline resistances stored in the node, ohm."""
+    """(U, K), ohm: baseline resistances stored in the node."""
     stated_noise: float
     """Relative noise stated in the hand file."""
     ordinary: bool
@@ -105,9 +105,9 @@ class CodeStream:
     codes: Codes
     """(T, U, K) received codes; MISSING if the chunk was lost."""
     truth_m: Float
-    """(T, U, N, 3) true displacement, metres."""
+    """(T, U, N, 3), metres: true displacement."""
     force_n: Float
-    """(T, 3) true force on the skin, newtons; NaN if unknown."""
+    """(T, 3), newtons: true force on the skin; NaN if unknown."""
     bad: NDArray[np.bool_]
     """(T, U, K) bool: True where a fault changed the reading."""
     touched: NDArray[np.bool_]
@@ -208,7 +208,7 @@ def make(
 def motion(
     layout: PatchLayout, load: Load, timeline: Timeline, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Return a sliding load's displacement (T, U, N, 3), metres, and force (T, 3), newtons.
+    """Return a sliding load's (T, U, N, 3) displacement in metres and (T, 3) force in newtons.
 
     The load slides by two pitches in a random direction, roughly towards the middle of the patch.
     """

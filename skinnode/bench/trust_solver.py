@@ -35,7 +35,7 @@ class HostPatch:
     watch: CodeWatch
 
     def field(self, codes: Codes, number: int, phase: int) -> FieldFrame:
-        """Solve scan ``number`` with the given codes (U, K) and conversion phase."""
+        """Solve scan ``number`` with the given (U, K) codes and conversion phase."""
         scan, stamp = _scan_of(self.solver.facts.profile, codes, number, phase)
         verdict = self.watch.judge(scan, number)
         field = verdict.applied(self.solver.solve(verdict.admitted(scan), stamp)[0])

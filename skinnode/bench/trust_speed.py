@@ -50,7 +50,7 @@ def rows(seed: int) -> list[dict[str, Any]]:
 
 
 def _fields(name: str, taken: CodeStream) -> list[tuple[Any, float]]:
-    """Solve every scan of a stream; return the fields and the solution times (s)."""
+    """Solve every scan of a stream; return the fields and the solve times (s)."""
     found = []
     if name == METHODS[0]:
         bare = _bare(taken)

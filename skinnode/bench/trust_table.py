@@ -35,7 +35,7 @@ NAMED: Final = 0.95
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
 """Timeline of a short stream, which ends while the load is held."""
 BLUNT_M: Final = 100e-6
-"""Maximum error of a trusted, precise field computed from half of the readings, metres: 5 % of the layer
+"""Maximum error of a trusted, precise field computed from half of the readings, in metres: 5 % of the layer
 height."""
 STEADY: Final = 0.95
 """Minimum fraction of fields with the right number of contacts, and of contacts with the right force."""
@@ -203,7 +203,7 @@ def _paths(seed: int) -> tuple[str, bool]:
 def _placed(off: float, *, stated: float | None = None) -> Callable[[int], tuple[str, bool]]:
     """Return a function that evaluates fields of patches with wires misplaced by ``off`` pitches.
 
-    ``stated`` is the placement tolerance in the hand file, pitches; default: ordinary tolerances.
+    ``stated`` is the placement tolerance stated in the hand file, in pitches; default: ordinary tolerances.
     """
     fault = _fault(f"wires placed {off:g} pitch off")
     config = None

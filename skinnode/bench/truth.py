@@ -1,8 +1,8 @@
 """Generates ground truth for benchmarks, independently of the assumptions of the solvers.
 
 Displacements are closed-form solutions for rigid spheres on rubber
-(:class:`skinnode.model.elastic.HertzContact`), which need neither grid nor prior. :class:`Skin` computes the
-resistances. Unlike the solver's model, a skin can have electrodes of finite size, strain-dependent
+(:class:`skinnode.model.elastic.HertzContact`), which need neither a grid nor a prior. :class:`Skin` computes
+the resistances. Unlike the solver's model, a skin can have electrodes of finite size, strain-dependent
 resistivity, a different layer height, or a contact resistance in series. :class:`Converter` adds noise and
 quantises the readings to codes.
 """
@@ -45,10 +45,10 @@ class Load(Protocol):
         """Full depth, metres."""
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) of surface points (P, 2), metres."""
+        """Return the (P, 3) displacements of the (P, 2) surface points, in metres."""
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,) on the rubber, newtons; NaN if it is unknown for this kind of body."""
+        """Return the (3,) force on the rubber, in newtons; NaN if it is unknown for this kind of body."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ class Press:
         return ((1, full), (-1, HertzContact(RUBBER, self.radius_m, depth, self.center_m)))
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) at surface points (P, 2), metres."""
+        """Return the (P, 3) displacements at the (P, 2) surface points, in metres."""
         moved = np.zeros((len(points_m), 3))
         for sign, contact in self.contacts(share):
             moved += sign * contact.displacement_m(points_m)
         return moved
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,) on the rubber, newtons."""
+        """Return the (3,) force on the rubber, in newtons."""
         force = np.zeros(3)
         for sign, contact in self.contacts(share):
             force += sign * np.array(contact.force_n)
@@ -88,7 +88,7 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A simulated patch, of which the solver knows only the nominal ``layout``.
+    """A simulated patch; the solver knows only its nominal ``layout``.
 
     Args:
         layout: Nominal layout, which is passed to the solver.
@@ -97,11 +97,11 @@ class Skin:
         strain: Coefficient β of the strain-dependent resistance ρ d (1 + β (d/d₀ − 1)), where d₀ is the
             distance d at rest.
         series: Contact resistance in series with each crossing, as a fraction of the crossing's R₀.
-        points_m: Positions (U, N, 2) of the upper electrodes in surface coordinates, for a curved patch.
-        axes: Local axes (U, N, 3, 3) at each upper electrode; the rows are two tangents and the outward
+        points_m: (U, N, 2) positions of the upper electrodes in surface coordinates, for a curved patch.
+        axes: (U, N, 3, 3) local axes at each upper electrode; the rows are two tangents and the outward
             normal.
-        upper_shift_m: Displacements (U, 3) of the upper wires from their nominal positions, metres.
-        lower_shift_m: Displacements (K, 3) of the lower wires from their nominal positions, metres.
+        upper_shift_m: (U, 3), metres: displacements of the upper wires from their nominal positions.
+        lower_shift_m: (K, 3), metres: displacements of the lower wires from their nominal positions.
     """
 
     layout: PatchLayout
@@ -132,7 +132,7 @@ class Skin:
 
     @property
     def _gap_m(self) -> Float:
-        """Distances (U, N), metres, of the upper electrodes from the lower layer, along the normals."""
+        """(U, N), metres: distances of the upper electrodes from the lower layer, along the normals."""
         gap = self.layout.upper_m[:, :, None] - self.layout.lower_m.reshape(-1, 3)
         nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)[..., None, None]
         assert self.axes is not None
@@ -141,7 +141,7 @@ class Skin:
         )
 
     def displacement_m(self, presses: tuple[Load, ...], share: float) -> Float:
-        """Return the displacement (U, N, 3) of the electrodes due to all presses, metres."""
+        """Return the (U, N, 3) displacement of the electrodes due to all presses, in metres."""
         points = self.body.upper_m[..., :2] if self.points_m is None else self.points_m
         moved = np.zeros((points.shape[0] * points.shape[1], 3))
         for press in presses:
@@ -151,11 +151,11 @@ class Skin:
 
     @functools.cached_property
     def rest_ohm(self) -> Float:
-        """Noise-free resistances (U, K) at rest, ohm, which are passed to the solver as the baseline."""
+        """(U, K), ohm: noise-free resistances at rest, passed to the solver as the baseline."""
         return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
 
     def resistance_ohm(self, displacement_m: Float) -> Float:
-        """Return the resistances (U, K), ohm, for a displacement (U, N, 3), metres."""
+        """Return the (U, K) resistances in ohms for a (U, N, 3) displacement in metres."""
         upper = self.body.upper_m + displacement_m
         if self.strain:
             found = self._strained(upper)
@@ -185,7 +185,7 @@ class Skin:
         return self._distance(self.body.upper_m)
 
     def _distance(self, upper: Float) -> Float:
-        """Return the distances (U, K, M, N) between upper and lower electrodes, metres."""
+        """Return the (U, K, M, N) distances between upper and lower electrodes, in metres."""
         gap = upper[:, None, None, :, :] - self.body.lower_m[None, :, :, None, :]
         return np.asarray(np.sqrt(np.einsum("ukmna,ukmna->ukmn", gap, gap)))
 
@@ -195,7 +195,7 @@ class Skin:
         return np.asarray(self.layout.resistivity_ohm_per_m / (1.0 / path).sum(axis=(2, 3)))
 
     def _finite(self, upper: Float) -> Float:
-        """Return the resistances (U, K), ohm, with potentials averaged over the rims of finite electrodes."""
+        """Return the (U, K) resistances, ohm, with potentials averaged over the rims of finite electrodes."""
         radius = self.electrode * self.layout.pitch_m
         rims = []
         for points, turned in ((upper, 0.0), (self.body.lower_m, 0.5)):
@@ -264,15 +264,15 @@ class Stream:
     """A sequence of frames to be solved, and the true displacements and forces."""
 
     frames_ohm: Float
-    """(T, U, K), readings in ohm; invalid readings are not finite."""
+    """(T, U, K), ohm: readings; invalid readings are not finite."""
     valid: NDArray[np.bool_]
     """(T, U, K)"""
     noise: Float
-    """(T, U, K), relative standard deviation of each reading."""
+    """(T, U, K) relative standard deviation of each reading."""
     truth_m: Float
-    """(T, U, N, 3), true displacement, metres; NaN in frames of a physically impossible motion."""
+    """(T, U, N, 3), metres: true displacement; NaN in frames of a physically impossible motion."""
     force_n: Float
-    """(T, 3), total force of all loads, newtons; NaN in frames of a physically impossible motion."""
+    """(T, 3), newtons: total force of all loads; NaN in frames of a physically impossible motion."""
     presses: tuple[Load, ...] = ()
 
     def every(self, stride: int) -> Stream:
@@ -295,12 +295,12 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Generate the stream of a patch that one or more superposed presses deform.
+    """Generate the stream of a patch deformed by one or more superposed presses.
 
     Args:
         skin: Patch to press.
         presses: Presses; their displacements are added.
-        shares: Fractions (T,) of the full depth, one per frame.
+        shares: (T,) fractions of the full depth, one per frame.
         converter: Converter that reads the resistances.
         rng: Random generator for the noise.
         gain: Factors by which the resistances are multiplied, (T, U, K) or broadcastable to that shape;

@@ -6,14 +6,14 @@ flagged    The status is not CONVERGED, or the data failed a test (``wires_trust
 accurate   The wire is not flagged, and every coordinate is within the reported uncertainty.
 wrong      The wire is not flagged, but an error is too large; or (with any status) a value is not finite.
 
-With noise, errors up to 5 reported standard deviations are accepted, a limit that 6e-7 of all coordinates
-exceed by chance. A long run must neither fail by chance nor miss a real defect. Each row of the report is
+With noise, errors of up to 5 reported standard deviations are accepted; 6e-7 of all coordinates exceed this
+limit by chance. A long run must neither fail by chance nor miss a real defect. Each row of the report is
 therefore tested against two conditions. If the errors are Gaussian with the reported standard deviation, a
 row violates each condition with a probability of 1e-4.
 
 - No error exceeds the larger of 5 and z(n) standard deviations, where n is the number of coordinates. The
   largest of n independent errors exceeds z(n) with a probability of 1e-4; z(n) is 5.7 for 9,000 coordinates
-  and 6.4 for 1e6. This is Bonferroni's bound: correlated errors exceed it less often.
+  and 6.4 for 1e6. This is the Bonferroni bound: correlated errors exceed it less often.
 - The number of seeds with an error above 5 standard deviations does not exceed a quantile of the binomial
   distribution. The probability per seed is bounded by the expected number of such errors in a seed. The test
   counts seeds, not coordinates, because only seeds are independent.
@@ -50,13 +50,13 @@ class Solved:
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3) reported standard deviation, metres. For path methods, the value is the error estimate
+    """(F, U, N, 3), metres: reported standard deviation. For path methods, the value is the error estimate
     divided by 5."""
     converged: NDArray[np.bool_]
     """(F, U) bool: True for a wire that is CONVERGED and, if trust was assessed, trusted."""
 
     def equals(self, other: Solved) -> bool:
-        """Return whether both results are bitwise equal."""
+        """Return whether the two results are bitwise equal."""
         return (
             np.array_equal(self.displacement_m, other.displacement_m, equal_nan=True)
             and np.array_equal(self.std_m, other.std_m, equal_nan=True)
@@ -70,7 +70,7 @@ def beyond(deviations: float) -> float:
 
 
 def limit_of(coordinates: int) -> float:
-    """Return the larger of 5 and z(n) for n ``coordinates``; the module docstring defines z(n)."""
+    """Return the larger of 5 and z(n), where n is ``coordinates``; the module docstring defines z(n)."""
     from scipy.special import ndtri
 
     if coordinates == 0:
@@ -104,7 +104,7 @@ class Tally:
     """Wires with an error above :data:`LIMIT`: (error in standard deviations or inf, seed, frame, wire)."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
-        """Add the result for a seed, ignoring frames whose true displacement (F, U, N, 3) is NaN."""
+        """Add the result for a seed, ignoring frames whose (F, U, N, 3) true displacement is NaN."""
         self.seeds += 1
         kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
         truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]

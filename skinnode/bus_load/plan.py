@@ -30,13 +30,15 @@ SDO_SHARE: Final = 0.01
 """Fraction of the bandwidth reserved for SDO: one request and one response every 27 ms at 1 Mbit/s."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""Maximum delay from SYNC to the first chunk, s, as specified for a node on an otherwise idle machine."""
+"""Maximum delay in seconds from SYNC to the first chunk, specified for an otherwise idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Maximum deviation of a chunk from its scheduled time, s, as specified for an otherwise idle machine."""
+"""Maximum deviation in seconds of a chunk from its scheduled time, specified for an otherwise idle
+machine."""
 
 _SAMPLES: Final = 512
-"""Number of random frames from which the mean frame length is estimated, to a standard error of 0.1 bits."""
+"""Number of random frames from which the mean frame length is estimated, with a standard error of 0.1
+bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ class PlannedFrame:
     scans: bool = False
     """Whether the frames are sent in every SYNC period."""
     response_s: float | None = None
-    """Worst-case response time, from queueing a frame to its last bit, s; None if unbounded."""
+    """Worst-case response time in seconds, from queueing a frame to its last bit; None if unbounded."""
 
     @property
     def frames_per_s(self) -> float:
@@ -88,9 +90,9 @@ class ScanTime:
     node_id: int
     chunks: int
     paced_s: float
-    """Nominal time from the first to the last chunk, s, set by the inhibit time."""
+    """Nominal time in seconds from the first to the last chunk, determined by the inhibit time."""
     worst_s: float | None
-    """Worst-case time from queueing the SYNC to the end of the summary, s; None if unbounded."""
+    """Worst-case time in seconds from queueing the SYNC to the end of the summary; None if unbounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +187,7 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Plan the traffic of each bus that has patches, whatever its load.
+    """Plan the traffic of each bus that has patches, regardless of its load.
 
     Args:
         hand: the hand.
@@ -308,7 +310,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Return each identifier's worst-case response time, s; None if unbounded."""
+    """Return each identifier's worst-case response time in seconds; None if unbounded."""
     messages = [
         Message(
             frame.can_id,
@@ -337,8 +339,8 @@ def _scan_time(
 ) -> ScanTime:
     """Compute the nominal and the worst-case duration of a patch's scans.
 
-    The worst case is the nominal duration plus the latency of the node and the response times of SYNC, last
-    chunk and summary.
+    The worst case is the nominal duration plus the latency of the node and the response times of the SYNC,
+    the last chunk and the summary.
     """
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s

@@ -1,6 +1,6 @@
 """Computes worst-case response times on a CAN bus, from queueing a frame to the end of its last bit.
 
-The method is that of section 3 in Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability
+The method follows section 3 of Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability
 analysis: Refuted, revisited and revised", Real-Time Systems 35, 2007. The frame with the lowest identifier
 wins arbitration, and a transmission is never preempted. The first instance of a message is not always the
 slowest, so the analysis examines every instance in the longest busy period of the message's priority level.
@@ -55,7 +55,7 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """Return the due time of an instance relative to instance 0, ns."""
+        """Return the due time of an instance relative to instance 0, in ns."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 
@@ -71,7 +71,7 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the maximum time from a frame's due time to the end of its last bit, ns.
+    """Return the maximum time in ns from a frame's due time to the end of its last bit.
 
     Args:
         message: the message.
@@ -79,8 +79,8 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
         bit_ns: bit time, ns; a frame queued up to one bit time after the start of arbitration can still win.
 
     Returns:
-        The response time; None if it is unbounded, because the message and those of higher priority need the
-        whole bandwidth.
+        The response time; None if it is unbounded, because this message and those of higher priority need the
+        entire bandwidth.
     """
     higher = [other for other in others if other.can_id < message.can_id]
     blocking_ns = max((other.time_ns for other in others if other.can_id > message.can_id), default=0)

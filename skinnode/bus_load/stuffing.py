@@ -1,7 +1,7 @@
 """Counts the bits of many frames, including stuff bits, for :mod:`skinnode.bus_load.timing`.
 
-The compiled kernels are in :mod:`skinnode.bus_load.stuffing_kernels`, which is imported on the first count: a
-node and the simulator of a kernel bus count no bits, and need not load numba.
+The compiled kernels are in :mod:`skinnode.bus_load.stuffing_kernels`, which is imported on first use: a node
+and the simulator of a kernel bus do not count bits, so they need not load numba.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 HEAD_BITS: Final = 19  # bits of SOF, 11-bit identifier, RTR, IDE, r0 and 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Number of bits in CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3)."""
+"""Number of bits in the CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space
+(3)."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res and BRS; plus the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
@@ -134,7 +135,7 @@ def classic_frame_bits(head: int, data: bytes) -> int:
     Returns:
         Number of bits, including stuff bits and inter-frame space.
     """
-    # The data are passed in two halves, because numba would compile the kernel again for numbers of 2⁶³ or
+    # The data are passed in two halves, because numba would recompile the kernel for numbers of 2⁶³ or
     # more.
     word = int.from_bytes(data, "big")
     return int(_kernels().classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, *_arrays()))

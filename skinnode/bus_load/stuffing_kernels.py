@@ -1,4 +1,4 @@
-"""Compiled kernels of :mod:`skinnode.bus_load.stuffing`, which count the bits of frames with stuff bits.
+"""Compiled kernels of :mod:`skinnode.bus_load.stuffing`, which count bits in frames, including stuff bits.
 
 The kernels take identifiers as uint32, lengths and payloads as uint8, and bit counts as int64 arrays.
 """

@@ -2,8 +2,9 @@
 
 In a classic frame, five consecutive equal bits between the start of frame and the end of the CRC sequence are
 followed by a stuff bit of the opposite value. A stuff bit can be the first of the next five equal bits. The
-13-bit tail has no stuff bits; it consists of CRC delimiter, ACK slot, ACK delimiter, 7-bit end of frame and
-3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value 0.
+13-bit tail has no stuff bits; it consists of the CRC delimiter, the ACK slot, the ACK delimiter, the 7-bit
+end of frame and the 3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value
+0.
 
 CRC and stuff bits are looked up in tables, one byte at a time, so leading filler bits pad the head of a frame
 to whole bytes. For the CRC, the filler bits are zeros, which leave the initial value of 0 unchanged. For
@@ -71,7 +72,7 @@ def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
 def exact_bits(
     can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int | None = None
 ) -> int:
-    """Return the exact number of bits of a classic frame, including stuff bits and inter-frame space.
+    """Return the exact number of bits in a classic frame, including stuff bits and inter-frame space.
 
     Args:
         can_id: identifier.
@@ -119,7 +120,7 @@ def exact_bits(
 def exact_fd_bits(
     can_id: int, data: bytes, *, extended: bool = False, brs: bool = True, esi: bool = False
 ) -> tuple[int, int]:
-    """Return the exact number of bits of a CAN FD frame, including stuff bits and inter-frame space.
+    """Return the exact number of bits in a CAN FD frame, including stuff bits and inter-frame space.
 
     Args:
         can_id: identifier.
@@ -200,7 +201,7 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
 
 @functools.cache
 def fd_worst_case_bits(length: int) -> tuple[int, int]:
-    """Return the maximum number of bits of a CAN FD frame with the given data length.
+    """Return the maximum number of bits in a CAN FD frame with the given data length.
 
     Args:
         length: number of data bytes.
@@ -215,7 +216,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
     # The 14 bits from SOF to IDE have at most one stuff bit after the first 5 bits and after every 4 more.
     # FDF, res and BRS alternate, ESI is 0, and the length code is known, so the first run is the single
-    # recessive bit BRS. The data bits are those of the worst case.
+    # recessive bit BRS. The data bits are assumed to be the worst case.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -228,7 +229,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
                 equal = equal + 1 if bit == value else 1
                 stuffed = equal == _RUN
                 state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
-                # The first fixed stuff bit replaces one that is due after the last bit.
+                # The first fixed stuff bit replaces a stuff bit that is due after the last bit.
                 total = count + (stuffed and number < len(choices))
                 after[state] = max(after.get(state, 0), total)
         stuff = after
@@ -268,7 +269,7 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counts frames, and the exact number of their bits.
+    """Counts frames and the exact number of bits in them.
 
     Adding a frame is fast, because bits are counted later, for a batch of frames. Instances are not
     thread-safe.
@@ -318,7 +319,7 @@ class BusLoad:
         """Count data frames with 11-bit identifiers.
 
         Args:
-            frames: for each frame, a tuple of identifier and data; further items of a tuple are ignored.
+            frames: for each frame, a tuple of identifier and data; further items are ignored.
             fd: whether the frames are CAN FD frames.
         """
         ids, data = self._fd if fd else self._classic
@@ -339,7 +340,7 @@ class BusLoad:
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the duration of all counted frames divided by ``time_s``; the ratio may exceed 1.
+        """Return the duration of all counted frames divided by ``time_s``; the ratio can exceed 1.
 
         Args:
             time_s: length of the interval, s.
@@ -369,9 +370,9 @@ class BusLoad:
 def _packed(
     ids: list[int], data: list[bytes]
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the identifiers (n,), the lengths (n,) and the concatenated data as arrays.
+    """Return the (n,) identifiers, the (n,) lengths and the concatenated data as arrays.
 
-    The arrays are writable copies, because numba would compile the kernels again for read-only arrays.
+    The arrays are writable copies, because numba would recompile the kernels for read-only arrays.
     """
     lengths, joined = bytearray(map(len, data)), bytearray().join(data)
     return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

@@ -33,7 +33,7 @@ class PdoDefault:
 
 
 def spare_pdo(cob_id: int | None) -> PdoDefault:
-    """Return the defaults of a spare PDO, which is disabled and has no mapped objects.
+    """Return the defaults for a spare PDO, which is disabled and has no mapped objects.
 
     Args:
         cob_id: COB-ID in the pre-defined connection set, without the node-ID; None if the set does not

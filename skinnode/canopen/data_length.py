@@ -7,11 +7,11 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""Payload lengths by data length code (DLC), bytes."""
+"""Payload lengths in bytes, by data length code (DLC)."""
 
 
 def fd_length(n_bytes: int) -> int:
-    """Return the length of the shortest CAN FD payload that holds ``n_bytes``, bytes.
+    """Return the length in bytes of the shortest CAN FD payload that holds ``n_bytes``.
 
     Args:
         n_bytes: number of bytes to send.

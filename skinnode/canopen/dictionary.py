@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of the data type, bits; 0 if it varies."""
+        """Length of the data type in bits; 0 if it varies."""
         return _BITS[self]
 
 
@@ -90,7 +90,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """Object of an object dictionary. A VAR or DOMAIN has only one entry, at sub-index 0."""
+    """Object in an object dictionary. A VAR or DOMAIN has only one entry, at sub-index 0."""
 
     index: int
     name: str
@@ -137,7 +137,7 @@ def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None 
     Args:
         index: index of the record.
         name: name of the record.
-        entries: entries from sub-index 1, in ascending order.
+        entries: entries from sub-index 1 upwards, in ascending order.
         first: entry at sub-index 0; by default, a constant with the highest sub-index.
     """
     first = first or highest(index, entries[-1].subindex)
@@ -158,8 +158,8 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
 ) -> Object:
     """Declare an array.
 
-    ``labels`` contains the names of the entries from sub-index 1. ``first`` is described in :func:`record`.
-    The other arguments are those of :class:`Entry`.
+    ``labels`` contains the names of the entries from sub-index 1 upwards. ``first`` is described in
+    :func:`record`. The other arguments are those of :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

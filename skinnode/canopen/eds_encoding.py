@@ -1,4 +1,4 @@
-"""Decoding of EDS and DCF files whose character encoding is unknown.
+"""Decodes EDS and DCF files whose character encoding is unknown.
 
 CiA 306 requires ASCII, but some tools write other encodings. Decoding is lossless: each non-ASCII byte
 becomes a lone surrogate (PEP 383). :func:`for_people` converts such text for display.
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum accepted size of an EDS file, bytes; twenty times the size of a patch's EDS."""
+"""Maximum accepted size of an EDS file in bytes; twenty times the size of a patch's EDS."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {
@@ -23,7 +23,7 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codec of the bytes in an :class:`EdsText`, by the name of its encoding."""
+"""Python codecs for the bytes in an :class:`EdsText`, by encoding name."""
 
 
 class EdsText(NamedTuple):
@@ -36,7 +36,7 @@ class EdsText(NamedTuple):
 
     @property
     def codec(self) -> str:
-        """Python codec of the bytes that the surrogates represent. UTF-16 files are converted to UTF-8."""
+        """Python codec for the bytes that the surrogates represent. UTF-16 files are converted to UTF-8."""
         return _CODECS[self.encoding]
 
     @property

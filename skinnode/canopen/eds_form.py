@@ -1,4 +1,4 @@
-"""Checks of EDS files for CiA 306 format errors that parsers silently ignore."""
+"""Checks EDS files for CiA 306 format errors that parsers silently ignore."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class EmcyCode(IntEnum):
 
     @property
     def register_bit(self) -> int:
-        """Bit of the error register that this error sets: communication or manufacturer-specific."""
+        """Error register bit that this error sets: communication or manufacturer-specific."""
         return 0x10 if self >> 12 == 8 else 0x80
 
 

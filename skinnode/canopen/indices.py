@@ -99,7 +99,7 @@ ERROR_FIELD: Final = 0x1003
 COB_ID_SYNC: Final = 0x1005
 CYCLE_PERIOD: Final = 0x1006
 SYNC_WINDOW: Final = 0x1007
-"""Index of the synchronous window length, µs."""
+"""Index of the synchronous window length (in µs)."""
 DEVICE_NAME_INDEX: Final = 0x1008
 HARDWARE_VERSION: Final = 0x1009
 SOFTWARE_VERSION: Final = 0x100A
@@ -132,11 +132,11 @@ range such as 0x1400 to 0x15FF."""
 PDO_MAPPING_OFFSET: Final = 0x200
 """Offset from the index of a PDO's communication record to that of its mapping record."""
 PDO_INVALID: Final = 1 << 31
-"""Bit in the COB-ID of a PDO that disables the PDO."""
+"""COB-ID bit that disables a PDO."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of the communication record of a PDO."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Lengths of the data types that can be mapped into an RPDO as dummies, bits, by data type index.
+"""Lengths in bits of the data types that can be mapped into an RPDO as dummies, by data type index.
 
 A node ignores the bytes of a dummy. BOOLEAN is not supported, because mapped objects must consist of whole
 bytes.
@@ -149,7 +149,7 @@ DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
 PDO_BYTES: Final = 12
-"""Sub-index of the maximum PDO length, bytes; 8 on classic CAN, 64 on CAN FD."""
+"""Sub-index of the maximum PDO length: 8 bytes on classic CAN, 64 bytes on CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
 """Sub-indices of the chunk index and the scan counter. On CAN FD, sub-index 1 is the number of the upper wire
@@ -181,13 +181,13 @@ CODES: Final = 0x2100
 """Index of the latest codes of upper wire 0, one code per sub-index. The codes of upper wire r are at index
 CODES + r."""
 BASELINE: Final = 0x2200
-"""Index of the R0 values of upper wire 0, ohm (0 if unknown), one crossing per sub-index. The values of upper
-wire r are at index BASELINE + r."""
+"""Index of the R0 values of upper wire 0, in ohms (0 if unknown), one crossing per sub-index. The values of
+upper wire r are at index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see :mod:`skinnode.protocol.coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""Index of the whole baseline, a DOMAIN: U·K REAL32 values of R0, ohm, ordered by upper wire. It must be
-written as a whole."""
+"""Index of the whole baseline, a DOMAIN: U·K REAL32 values of R0 in ohms, ordered by upper wire. The baseline
+must be written as a whole."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")

@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Value in place of the node-ID of a device without one."""
+"""Value that replaces the node-ID in a device without a node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -18,7 +18,7 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates by index in the bit timing table of CiA 301, bit/s. Index 5 is reserved, and index 9 selects
+"""Bit rates in bit/s, by index in the bit timing table of CiA 301. Index 5 is reserved, and index 9 selects
 automatic bit rate detection."""
 
 LSS_DONE: Final = 0
@@ -55,7 +55,7 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """States of an LSS slave, with their values in *switch state global*."""
+    """States of an LSS slave, with their values in the service *switch state global*."""
 
     WAITING = 0
     CONFIGURATION = 1

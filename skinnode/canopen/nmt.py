@@ -10,7 +10,7 @@ STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
 A node obeys NMT commands in every state except INITIALISING. *Reset node* (129) sets all objects to their
-power-on values. *Reset communication* (130) does so only from 0x1000 to 0x1FFF. Then the node boots.
+power-on values. *Reset communication* (130) does so only for objects 0x1000 to 0x1FFF. Then the node boots.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus and the hand that contains it; the hand is None without a hand file."""
+    """A bus and the hand that contains it; the hand is None if no hand file is given."""
 
     bus: BusConfig
     hand: HandConfig | None

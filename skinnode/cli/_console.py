@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for output to a pipe or file, columns; too large for any line to be wrapped."""
+"""Console width in columns for output to a pipe or file; so large that no line is wrapped."""
 
 
 def print_json(value: Any) -> None:

@@ -43,7 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Wrap ``stream`` to escape control characters and characters that its encoding lacks."""
+    """Wrap ``stream`` to escape control characters and characters that its encoding cannot represent."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
@@ -73,7 +73,7 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    For a missing or invalid value, Typer's own message lacks the meaning of the argument, the value given or
+    For a missing or invalid value, Typer's own message omits the meaning of the argument, the value given or
     the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")

@@ -13,7 +13,7 @@ status  meaning
 
 A command stopped by a signal prints nothing, because the signal was sent on purpose. The command closes open
 resources before it exits. SIGHUP stays ignored if it was ignored at the start, as under nohup. This module
-imports only modules that load fast, so that its handlers are installed before the others are loaded.
+imports only modules that load fast, so that its handlers are installed before other modules are loaded.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     except Stopped as stopped:
         status = int(stopped.code or 0)
         _flush(status)
-    _handle(_exit_at_once)  # otherwise, a signal during the wait for threads prints a traceback
+    _handle(_exit_at_once)  # otherwise, a signal received while waiting for threads prints a traceback
     sys.exit(status)
 
 

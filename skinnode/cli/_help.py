@@ -1,6 +1,6 @@
-"""Formats command help: docstrings as running text, and no type beside options that take no value.
+"""Formats command help: reflows docstrings, and omits the type beside options that take no value.
 
-Typer keeps a docstring's line breaks, which then fall in the middle of a terminal's lines. Typer also prints
+Typer keeps a docstring's line breaks, which then fall in the middle of terminal lines. Typer also prints
 ``<bool>`` beside each option that takes no value.
 """
 

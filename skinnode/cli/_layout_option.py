@@ -1,4 +1,4 @@
-"""Implements option ``--layout``: the geometry of a patch as a preset, a file or a Python name."""
+"""Implements the option ``--layout``: the geometry of a patch as a preset, a file or a Python name."""
 
 from __future__ import annotations
 

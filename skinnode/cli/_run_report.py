@@ -144,7 +144,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Describe the measured noise and the noise stated in the hand file; return "" if they agree."""
+    """Describe the measured noise and the noise stated in the hand file, or "" if they agree."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -153,7 +153,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why the patch is faulty or refused; "" in any other condition."""
+    """Return ``before`` and the reason why the patch is faulty or refused, or "" in any other condition."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -238,7 +238,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the deepest electrode's depth (positive towards −z) and its standard deviation, m."""
+    """Return the deepest electrode's depth (positive towards −z) and its standard deviation, in metres."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -306,7 +306,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Describe a field's imprecision and the number of faults in its readings; return "" if there are none."""
+    """Describe a field's imprecision and the number of faults in its readings, or "" if none."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} in the readings; the affected readings are excluded"

@@ -188,7 +188,7 @@ def accuracy(
         Literal["detection", "families"] | None,
         typer.Option(
             help="Run only this part: the touch detector, or both priors on families of loads that neither "
-            "expects. For families, --scenes counts the scenes of a family for each layout and noise."
+            "expects. For families, --scenes counts the scenes per family, layout and noise level."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,
@@ -201,10 +201,10 @@ def accuracy(
 ) -> None:
     """Measure the displacement error as a function of solve time, noise and code width.
 
-    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With `--only
-    detection`, it measures which touches the detector finds, how soon it finds them, and how many false
-    alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time, because
-    times depend on the machine.
+    The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
+    `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
+    false alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time,
+    because times depend on the machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)
@@ -214,7 +214,7 @@ def accuracy(
     _prepare(json, plot)
     if only == "families":
         if plot is not None:
-            raise typer.BadParameter("got --plot, which --only families does not support", param_hint="--plot")
+            raise typer.BadParameter("got --plot, which --only families cannot draw", param_hint="--plot")
         figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
     else:
         figures = bench.run(scenes, rounds)
@@ -339,7 +339,7 @@ def _print_real_time(figures: dict[str, Any]) -> None:
             f"simulator in real time on udp_multicast, hop_limit {row['hop_limit']}: "
             f"{row['patches']} patches, {row['touched']} touched, {row['frames_per_s']:.0f} frames/s: "
             f"{row['simulator']:.2f} of a core, {row['skipped']} of {scans} scans skipped; "
-            f"host {row['host']:.2f} of a core, {row['fields']} fields; load of the machine {row['load']:.1f}"
+            f"host {row['host']:.2f} of a core, {row['fields']} fields; machine load {row['load']:.1f}"
         )
     times = figures["frame_us"]
     typer.echo(
@@ -436,13 +436,13 @@ def pipeline(
 @app.command()
 def recording(
     json: JsonFile = None,
-    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of fully loaded buses with four patches each.")] = 4,
+    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of full buses, four patches each.")] = 4,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of each recording in minutes.")] = 1.0,
     block: Annotated[
         float, typer.Option(min=1, help="Duration of the simulated traffic, which is repeated, s.")
     ] = 5.0,
 ) -> None:
-    """Write recordings of fully loaded buses; measure their size and write cost, and MCAP seek time."""
+    """Write recordings of fully loaded buses; measure their size, write cost and MCAP seek time."""
     from skinnode.bench import recording as bench
     from skinnode.messages.typestore import require_mcap
 
@@ -477,7 +477,7 @@ def remote(
     json: JsonFile = None,
     seconds: Annotated[float, typer.Option(min=1, help="Duration, s.")] = 60.0,
     publish_only: Annotated[
-        bool, typer.Option("--publish-only", help="Measure only the host, without a second process and pings.")
+        bool, typer.Option("--publish-only", help="Measure the host without a second process or pings.")
     ] = False,
 ) -> None:
     """Run a host with sixteen patches and a program in a second process; measure losses and latency.

@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: finds faults, and prints the certainty and the remedy of each fault."""
+"""``skinnode doctor [HAND.toml]``: finds faults, and prints the certainty and the remedy for each fault."""
 
 from __future__ import annotations
 

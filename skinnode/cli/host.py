@@ -49,12 +49,12 @@ def host(
 
     Onsets and releases of touches are reported when they happen. With --json, each patch has `touched`,
     `touch_odds` and `contacts` (null before the first field): centroid, area, normal and shear force with
-    standard deviations, in m, m² and N. With --publish, other processes can use the hand
-    (sk.connect in Python, or ROS 2 by rmw_zenoh). Ctrl-C ends the command and leaves the nodes
-    pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
-    reported errors, or a guest received no SYNC. The exit status is also 1 if a scan was torn or a frame was
-    lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
-    be run, or if a node sent frames whose content does not match their identifier.
+    standard deviations, in m, m² and N. With --publish, other processes can use the hand (sk.connect in
+    Python, or ROS 2 via rmw_zenoh). Ctrl-C ends the command and leaves the nodes pre-operational. The exit
+    status is 1 if a patch was not operational at the end, an interface failed or reported errors, or a guest
+    received no SYNC. The exit status is also 1 if a scan was torn or a frame was lost, unless the node
+    reported that its computer was too slow. The exit status is 2 if the hand could not be run, or if a node
+    sent frames whose content does not match their identifier.
     """
     from skinnode.config import load_hand
 
@@ -117,7 +117,7 @@ def _note_touches(events: EventSubscription, report: Report) -> None:
 
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Collect the fields, and report touches as they happen and values every second, until the end."""
+    """Collect the fields; report touches as they happen, and the host's state every second."""
     from skinnode.cli._run_report import Second
 
     start_s = time.monotonic()

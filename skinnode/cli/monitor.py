@@ -103,7 +103,7 @@ def _require_screen() -> None:
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a source that runs a host, after the slow import of the screen."""
+    """Import the screen, which is slow, and return a source that runs a host."""
     from skinnode.cli._console import progress
 
     if not quiet:

@@ -1,5 +1,5 @@
 """Plots benchmark results; requires matplotlib.
 
-``ratios`` plots the benchmarks ``kernel`` and ``solve``. Each other module has the name of the benchmark that
+``ratios`` plots the benchmarks ``kernel`` and ``solve``. Every other module is named after the benchmark that
 it plots.
 """

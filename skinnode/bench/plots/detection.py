@@ -29,7 +29,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
             axes.semilogx(row["alarms_per_hour"], row[name], color=colour, linestyle=style, label=name)
         axes.axvline(0.1, color="black", linewidth=0.5)
         axes.set_title(f"{row['kind']}, {row['depth']:.0%} of the layer height")
-        axes.set_xlabel("false alarms of a patch, 1/h")
+        axes.set_xlabel("false alarms per patch, 1/h")
         axes.set_ylim(0.0, 1.02)
         axes.grid(visible=True, alpha=0.3)
     first = figure.axes[0]
@@ -37,6 +37,6 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     first.legend(loc="upper left", fontsize=8, frameon=False)
     figure.suptitle(
         "skinnode bench accuracy --only detection: staggered, h = 0.5, noise 1e-3, 12.5 scans/s; "
-        "the known load is known in place, size and depth, and seen in one frame"
+        "known load: the detector knows its position, size and depth, and sees one frame"
     )
     save_figure("--plot", file, figure, 100)

@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Plot the fractions of the verdicts as a stacked bar for each row; enlarge the fraction ``wrong``."""
+    """Plot each row's verdicts as a stacked bar of fractions; enlarge the fraction ``wrong``."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:

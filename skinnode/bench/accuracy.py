@@ -63,7 +63,7 @@ def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement: its name, the measured value, the limit as text, and whether it is met.
+    """Return one row per requirement: name, measured value, limit as text, and whether the limit is met.
 
     Limits on execution times are marked ``absolute``. Execution times depend on the machine, so exceeding
     such a limit does not make the benchmark fail.

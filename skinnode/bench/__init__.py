@@ -8,5 +8,5 @@ Each subcommand of ``skinnode bench`` has a module whose function ``run`` return
 types. ``skinnode.cli.bench`` prints the results and writes them to files. ``truth`` simulates presses with
 closed-form models that share no assumptions with the solvers. ``memory`` measures the memory of the process.
 ``load``, ``scale``, ``real_time``, ``soak`` and ``trust_road`` use the simulator, in which complete nodes
-generate the CAN frames. ``family_scenes`` uses only its contact mechanics.
+generate the CAN frames. ``family_scenes`` uses only the simulator's contact mechanics.
 """

@@ -19,8 +19,8 @@ ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
 """Maximum error of the posterior for each layout, as a fraction of the RMS displacement, for a 10 % press at
 h = 0.5 with a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Number of scenes in a row of the coverage table for each scene in a cell of the noise and code tables. A
-cell needs at least three scenes; each contributes 300 coordinates to its RMS error."""
+"""Number of scenes per row of the coverage table, divided by the number per cell of the noise and code
+tables. A cell needs at least three scenes; each contributes 300 coordinates to its RMS error."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
 
     Args:
         scenes: Number of scenes of each family for each layout and noise.
-        echo: Function that prints a line about the progress.
+        echo: Function that prints a progress line.
     """
     figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
     figures |= families.run(scenes, echo)
@@ -63,7 +63,7 @@ def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per requirement: its name, the measured value, the limit as text, and whether it is met.
+    """Return one row per requirement: name, measured value, limit as text, and whether the limit is met.
 
     Limits on execution times are marked ``absolute``. Execution times depend on the machine, so exceeding
     such a limit does not make the benchmark fail.

@@ -1,4 +1,4 @@
-"""``skinnode resolve RECORDING…``: solves recordings again with other options, on several processes."""
+"""``skinnode resolve RECORDING…``: solves recordings again with other options, in several processes."""
 
 from __future__ import annotations
 
@@ -69,10 +69,10 @@ def resolve(
 ) -> None:
     """Solve recordings again, with other options or calibrations, and compare the results.
 
-    The results are those of a replay with these options, bit for bit, whatever the number of processes. The
-    fields of a recording go into one file, like those of `skinnode convert`. With several values of an
-    option, every combination is solved, and a table compares them. If the command is interrupted, the same
-    command continues; lost workers change nothing.
+    The results are bit-identical to a replay with these options, regardless of the number of processes. The
+    fields of a recording go into one file, like those of `skinnode convert`. If an option has several values,
+    every combination is solved, and a table compares the results. To resume after an interruption, run the
+    same command again; lost workers do not affect the results.
 
     The exit status is 1 if a recording is damaged, incomplete or lacks frames, and 2 if the command could not
     run.
@@ -101,7 +101,7 @@ def resolve(
 
 
 def _check(kind: str, processes: int | None, scheduler: str | None) -> None:
-    """Check, before any work, that the options fit together and that the packages are installed."""
+    """Check in advance that the options are compatible and that the required packages are installed."""
     from skinnode.errors import ConfigError
     from skinnode.messages.typestore import require_mcap
     from skinnode.record.parquet_file import require_pyarrow
@@ -131,7 +131,7 @@ def _workers(processes: int | None, scheduler: str | None, folder: Path) -> Any:
 
 @contextmanager
 def _bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Yield a function that shows the progress on stderr, if it is a terminal."""
+    """Yield a function that shows the progress on stderr if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield lambda done, total, newest: None
         return

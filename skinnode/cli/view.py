@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from skinnode.view.viewer_process import ViewerProcess
 
 _LOOK_S = 0.1
-"""Interval between checks of the viewer, s."""
+"""Interval at which the viewer is checked, s."""
 _PORTS = 65_534
 
 
@@ -86,13 +86,13 @@ def view(
     ] = 10.0,
     seconds: Seconds = None,
 ) -> None:
-    """Show a hand in 3-D: pressed surfaces, shear, contacts and forces, health, events, curves over time.
+    """Show a hand in 3-D: pressed surfaces, shear, contacts and forces, health, events and plots over time.
 
     The command runs the hand like `skinnode host`, but waits for missing patches. With neither --web nor
     --save, it opens a window and ends when the window is closed. With only --replay and --save, it converts
     the whole recording as fast as possible. Requires the optional packages of the `view` extra. The exit
-    status is 0 if no fault occurred, 1 if any fault occurred (faults are printed at the end), and 2 if the
-    command could not run.
+    status is 0 if no fault occurred, 1 if any fault occurred (the faults are printed at the end), and 2 if
+    the command could not run.
     """
     from skinnode.errors import ConfigError
 
@@ -141,7 +141,7 @@ def _require_viewer() -> None:
 
 
 def _open(stack: ExitStack, options: OutputOptions) -> Output:
-    """Open the output; called before the hand is opened, so a port in use is reported immediately."""
+    """Open the output; called before the hand is opened, so that a port in use is reported immediately."""
     from skinnode.view.outputs import open_output
 
     output = stack.enter_context(open_output(options))
@@ -194,7 +194,7 @@ def _show(
     stop: threading.Event,
     drawing: _Drawing,
 ) -> tuple[list[str], DrawnCounts]:
-    """Draw a source until the drawing ends; return the faults and the field counts."""
+    """Draw the source's fields until drawing stops; return the faults and the field counts."""
     from skinnode.view.drawing_thread import DrawingThread
 
     with DrawingThread(source, process.draw, rate_hz=drawing.rate_hz) as thread:
@@ -209,7 +209,7 @@ def _show(
 def _wait(
     source: Source, output: Output, thread: DrawingThread, stop: threading.Event, seconds: float | None
 ) -> None:
-    """Wait until the user, the time limit, the viewer, an error or the recording's end ends the drawing."""
+    """Wait until the user, the time limit, the viewer, an error or the end of the recording stops drawing."""
     import time
 
     end_s = None if seconds is None else time.monotonic() + seconds

@@ -7,7 +7,8 @@ so two processes that compile different signatures at the same time can mix up t
 This cache has a separate file for each compiled signature. The file contains a magic number, the SHA-256 of
 the payload, and the payload. Its name contains a digest of all inputs of the compilation, so that no index is
 needed. Files are replaced atomically. A file that fails the check is removed, and the kernel is compiled
-again. This event, or a failure to write a file, is logged in one line; no error reaches the caller.
+again. The removal of a file, or a failure to write one, is logged in one line; no exception reaches the
+caller.
 """
 
 from __future__ import annotations
@@ -67,8 +68,9 @@ class KernelCache:
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled code of ``signature``; None if there is no usable file.
 
-        Numba's own cache first calls ``target_context.refresh()``. This loads all that only the compiler
-        needs, including scipy.linalg, and takes 0.2 s in every process. The compiler calls it itself.
+        Numba's own cache first calls ``target_context.refresh()``. This loads modules that only the compiler
+        needs, including scipy.linalg, and takes 0.2 s in every process. The compiler calls ``refresh()``
+        itself.
         """
         path = self._path(signature, target_context.codegen())
         try:
@@ -142,9 +144,9 @@ def _write(path: Path, payload: bytes) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Remove all damaged files in ``folder`` at once, and log them in one line.
+    """Remove all damaged files in ``folder`` and log a single line about them.
 
-    If several processes find damaged files at the same time, only one of them removes and logs them.
+    If several processes find damaged files at the same time, only one process removes and logs the files.
     """
     with _locked(folder):
         files = list(folder.glob(f"*{SUFFIX}"))
@@ -196,7 +198,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log a warning about the cache, but only once per process, folder and kind of message."""
+    """Log a warning about the cache, at most once per process, folder and kind of message."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default limit of the planned bus load, as a fraction. Above it, the response times of low-priority frames
-grow steeply (Davis, Burns, Bril and Lukkien, Controller Area Network (CAN) schedulability analysis, Real-Time
-Systems 35, 2007), and too little capacity is left to repeat frames after errors."""
+"""Default limit for the planned bus load, as a fraction. Above this limit, the response times of low-priority
+frames grow steeply (Davis, Burns, Bril and Lukkien, Controller Area Network (CAN) schedulability analysis,
+Real-Time Systems 35, 2007), and too little capacity is left to retransmit frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]
@@ -52,18 +52,18 @@ class BusConfig(Table):
         Field(ge=10_000, le=1_000_000),
         Allowed("an integer from 10000 to 1000000, as in classic CAN"),
     ] = 1_000_000
-    """Bits per second; for CAN FD frames, the bit rate of the arbitration phase."""
+    """Bit rate, bits per second; for CAN FD frames, the bit rate of the arbitration phase."""
     fd: bool = False
     """Send the PDOs of the patches on this bus in CAN FD frames with bit-rate switching."""
     data_bitrate_bps: Annotated[
         int, Field(ge=10_000, le=8_000_000), Allowed("an integer from 10000 to 8000000")
     ] = 5_000_000
-    """Bits per second in the data phase of CAN FD frames, from ESI to the CRC delimiter."""
+    """Bit rate of the data phase of CAN FD frames, from ESI to the CRC delimiter, bits per second."""
     options: dict[str, bool | int | float | str] = Field(default={})
     """Additional keyword arguments for the interface in python-can."""
     role: Annotated[Role, one_of(Role)] = "master"
-    """Role of the host: ``master`` if it sends NMT and SYNC on the bus, ``guest`` if the robot's own master
-    does."""
+    """Role of the host: ``master`` if it sends NMT commands and SYNC on the bus, ``guest`` if the robot's own
+    master does."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
     """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
     the patches and read their data."""

@@ -55,7 +55,7 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``, or its text truncated to 60 characters if it is longer."""
+    """Return ``value``, or its text truncated to 60 characters if the text is longer."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 

@@ -64,13 +64,13 @@ class Result:
     why: str = ""
     """Reason for the verdict; empty if the device passed.
 
-    For a failure, this is what was expected and what was received.
+    For a failure, the text says what was expected and what was received.
     """
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
-    """Newest frames sent and received during the case."""
+    """Most recent frames sent and received during the case."""
 
 
 def case(id: str, title: str, clause: str) -> Callable[[Callable[[Dut], None]], Case]:
-    """Return a decorator that turns a function into a case."""
+    """Return a decorator that turns a function into a conformance case."""
     return lambda run: Case(id, title, clause, run)

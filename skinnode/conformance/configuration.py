@@ -16,7 +16,7 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Objects that are written after all others, and their order. The SYNC counter overflow value can be written
+"""Objects that are written after all others, in this order. The SYNC counter overflow value can be written
 only while the SYNC period (0x1006) is 0. Writing 0x1005 may start the SYNC producer. 0x1020 comes last,
 because writing any other object clears it."""
 
@@ -30,7 +30,7 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # the cases of area OD report this
+            continue  # reported by the OD cases
     return values
 
 

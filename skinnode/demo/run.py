@@ -47,10 +47,10 @@ class PatchReport:
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Number of scans that were skipped, because a newer scan arrived before a solver was free."""
+    """Number of scans that were skipped because a newer scan arrived before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """Number of PDOs that the node sent and the host did not assemble into scans."""
+    """Number of PDOs that the node sent but the host did not assemble into scans."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -71,9 +71,9 @@ class Report:
     """Number of PDOs assembled into scans by the host."""
     frames_lost: int
     bus_load: float
-    """Equivalent bus load: fraction of the duration for which all frames would occupy a 1 Mbit/s bus."""
+    """Equivalent bus load: fraction of the run time for which the frames would occupy a 1 Mbit/s bus."""
     faults: tuple[str, ...]
-    """Faults, each of which causes exit status 1; empty if the run succeeded."""
+    """Faults found, any of which causes exit status 1; empty if the run succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ def _depth_std_m(frame: FieldFrame) -> float:
 
 
 class _Progress:
-    """Displays the progress of a run, as a live view on a terminal or else as one line per second."""
+    """Displays the progress of a run: a live view on a terminal, otherwise one line per second."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -233,7 +233,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Score and display only while no scan is being solved, so as not to delay the host.
+                    # Score and display only while no scan is being solved, to avoid delaying the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)

@@ -109,7 +109,7 @@ class SdoClient:
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """Send a request and return its response, like :meth:`ask`. Raises Aborted if it is an abort."""
+        """Send a request and return the response, like :meth:`ask`. Raises Aborted if the device aborts."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
@@ -220,7 +220,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Return the data of a sub-block, its number of segments, and whether it is the last sub-block."""
+        """Return the data and the segment count of a sub-block, and True if it is the last sub-block."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)

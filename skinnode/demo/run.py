@@ -55,7 +55,7 @@ class PatchReport:
     latency_p99_ms: float
     score: Score
     distrust: str = ""
-    """Why the newest untrusted field was not trusted; empty if all fields were trusted."""
+    """Reason why the newest untrusted field was not trusted; empty if all fields were trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class _Watch:
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
-    """Why the newest untrusted field was not trusted; empty if all fields were trusted."""
+    """Reason why the newest untrusted field was not trusted; empty if all fields were trusted."""
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp

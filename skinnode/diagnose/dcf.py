@@ -48,7 +48,7 @@ class Dcf(NamedTuple):
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
     """Return the DCF of a device: its EDS with commissioning data and the values of its writable objects.
 
-    The text is meant for a UTF-8 file, even if the EDS has another encoding.
+    The text is meant for a UTF-8 file, even if the EDS has a different encoding.
 
     Args:
         sheet: EDS of the device.
@@ -126,7 +126,7 @@ def _is_configuration(reading: Reading) -> bool:
 def _standard_form(reading: Reading, data: bytes) -> str | None:
     """Return the value in CiA 306 notation; None if this would change its bytes.
 
-    Integers from 10 on are written in hexadecimal, and reals as their bit patterns, as conforming tools
+    Integers of 10 or more are written in hexadecimal, and reals as their bit patterns, as conforming tools
     expect.
     """
     if reading.data_type in _STRINGS:
@@ -141,7 +141,7 @@ def _standard_form(reading: Reading, data: bytes) -> str | None:
 
 
 def _plain(data: bytes, codec: str) -> str | None:
-    """Decode a string; None if some INI reader would change it."""
+    """Decode a string; None if an INI reader might change it."""
     try:
         text = data.decode(codec)
     except UnicodeDecodeError:

@@ -46,7 +46,7 @@ def node(
         int, typer.Option(min=10_000, max=1_000_000, help="Bits per second.", metavar="BPS")
     ] = 1_000_000,
     fd: Annotated[
-        bool, typer.Option("--fd", help="Send PDOs in CAN FD frames with bit-rate switch.")
+        bool, typer.Option("--fd", help="Send PDOs in CAN FD frames with bit-rate switching.")
     ] = False,
     data_bitrate: Annotated[
         int, typer.Option(min=10_000, max=8_000_000, help="Data bit rate of CAN FD frames.", metavar="BPS")

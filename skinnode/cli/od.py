@@ -106,7 +106,7 @@ def _require_combination(
         raise ConfigError("--write", write, "only with INDEX[:SUB]")
     if diff is not None and (where is not None or write is not None or dcf is not None):
         raise ConfigError(
-            "--diff", str(diff), "only without these options, because it compares the whole dictionary"
+            "--diff", str(diff), "without INDEX, --write and --dcf, because it compares the whole dictionary"
         )
     if dcf is not None and where is not None:
         raise ConfigError("--dcf", str(dcf), "only without INDEX, because it covers the whole dictionary")

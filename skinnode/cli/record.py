@@ -97,7 +97,8 @@ def _run(
             faults, notes = faults_and_notes(running)
             skipped = {name: stream.skipped for name, stream in running.stats().patches.items()}
             notes += [
-                f"{name}: {counted(count, 'scan')} skipped for newer ones; their frames were recorded"
+                f"{name}: {counted(count, 'scan')} skipped in favour of newer scans; "
+                "their frames were recorded"
                 for name, count in skipped.items()
                 if count
             ]

@@ -36,8 +36,8 @@ def resolve(
         list[str] | None,
         typer.Option(
             "--set",
-            help="Option that replaces the recorded one: a key of the hand file, solver.KEY or "
-            "patches.NAME.KEY, where NAME can be *. Several values, separated by commas, are tried in turn.",
+            help="Override a recorded option: a key of the hand file, solver.KEY or "
+            "patches.NAME.KEY, where NAME can be *. Several comma-separated values are tried in turn.",
             metavar="KEY=VALUE[,VALUE...]",
         ),
     ] = None,
@@ -45,7 +45,7 @@ def resolve(
         Path | None,
         typer.Option(
             "--hand",
-            help="Hand file for logs without a journal, such as candump logs of another master.",
+            help="Hand file for logs without a journal, such as candump logs from another master.",
             metavar="HAND.toml",
         ),
     ] = None,

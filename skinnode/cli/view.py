@@ -60,29 +60,29 @@ def view(
     address: Annotated[
         str | None,
         typer.Option(
-            help="Address on which --web listens; default 127.0.0.1, which only this machine reaches.",
+            help="Address on which --web listens; default 127.0.0.1, which only this machine can reach.",
             metavar="IP",
         ),
     ] = None,
     port: Annotated[
         int | None,
         typer.Option(
-            min=1, max=_PORTS, help="Port of --web; default 9090. The next port is used too.", metavar="PORT"
+            min=1, max=_PORTS, help="Port for --web; default 9090. The next port is used too.", metavar="PORT"
         ),
     ] = None,
     save: Annotated[
         str | None,
         typer.Option(
-            help="Write a new file that `rerun FILE.rrd` shows; without a window.", metavar="FILE.rrd"
+            help="Write a new file for `rerun FILE.rrd` instead of opening a window.", metavar="FILE.rrd"
         ),
     ] = None,
     rate: Annotated[
         float,
-        typer.Option(min=0.1, max=1000.0, help="Maximum pictures of a patch per second.", metavar="HZ"),
+        typer.Option(min=0.1, max=1000.0, help="Maximum drawing rate of each patch, in Hz.", metavar="HZ"),
     ] = 30.0,
     exaggerate: Annotated[
         float,
-        typer.Option(min=0.0, max=1000.0, help="Draw displacements this many times enlarged.", metavar="X"),
+        typer.Option(min=0.0, max=1000.0, help="Factor by which to enlarge displacements.", metavar="X"),
     ] = 10.0,
     seconds: Seconds = None,
 ) -> None:
@@ -146,7 +146,7 @@ def _open(stack: ExitStack, options: OutputOptions) -> Output:
 
     output = stack.enter_context(open_output(options))
     if output.page_url is not None:
-        print(f"open {output.page_url} in a browser; Ctrl-C ends", flush=True)
+        print(f"open {output.page_url} in a browser; press Ctrl-C to stop", flush=True)
     return output
 
 
@@ -221,7 +221,7 @@ def _wait(
             return
         if source.over and not over:
             over = True
-            print("end of the recording; Ctrl-C ends", flush=True)
+            print("end of the recording; press Ctrl-C to stop", flush=True)
         if output.viewer is not None and output.viewer.ended:
             if output.page_url is None and output.viewer.closed:  # by the user
                 return
@@ -248,7 +248,7 @@ def _convert(
 
 def _report(faults: list[str], counts: DrawnCounts) -> None:
     print(
-        f"{counts.drawn} fields drawn, {counts.left_out} left out for newer ones, "
+        f"{counts.drawn} fields drawn, {counts.left_out} left out in favour of newer fields, "
         f"{counts.dropped} dropped because drawing was too slow"
     )
     for fault in faults:

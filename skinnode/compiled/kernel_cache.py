@@ -105,7 +105,7 @@ class KernelCache:
             reason = error.strerror or type(error).__name__
             _report(
                 self._folder,
-                f"a compiled kernel could not be cached ({reason}); it is recompiled at the next start",
+                f"a compiled kernel could not be cached ({reason}); it will be recompiled at the next start",
             )
 
     def enable(self) -> None:

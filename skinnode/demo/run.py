@@ -366,7 +366,7 @@ def print_report(console: Console, report: Report) -> None:
             soft_wrap=True,
         )
     else:
-        console.print("no patch was pressed during this run; use a larger --seconds")
+        console.print("no patch was pressed during this run; increase --seconds")
     for fault in report.faults:
         console.print("fault: ", style="bold red", end="")
         console.print(fault)

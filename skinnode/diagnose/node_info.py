@@ -53,7 +53,7 @@ class PatchInfo:
     shorted_upper: tuple[int, ...]
     open_lower: tuple[int, ...]
     shorted_lower: tuple[int, ...]
-    """Numbers of the open and the shorted wires, counted from 0."""
+    """Indices of the open and shorted wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
     """Number of received frames that the node rejected, by reason; counts of 0 are omitted."""

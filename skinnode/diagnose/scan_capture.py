@@ -1,4 +1,4 @@
-"""Assembles the scans of patches as the host does, and records SYNCs. Nothing is solved."""
+"""Assembles the patches' scans in the same way as the host, and records SYNCs. Nothing is solved."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ScanCapture:
 
         Args:
             node_id: The node.
-            profile: Numbers of wires and other sizes of the patch.
+            profile: Number of wires and other dimensions of the patch.
             overflow: Overflow value of the SYNC counter; 0 if SYNC has no counter.
             period_s: SYNC period, s.
         """

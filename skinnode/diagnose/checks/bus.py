@@ -107,7 +107,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "two SYNC producers",
             Sure.CERTAIN,
-            f"{astray} of {len(steps)} SYNC counters are not the successor of the previous counter",
+            f"{astray} of {len(steps)} SYNC counters do not follow the previous counter",
             stop_one,
         )
     if bus.master_beats_s is not None and len(bus.master_beats_s) >= _BEATS and bus.heartbeat_ms:

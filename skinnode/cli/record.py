@@ -55,8 +55,8 @@ def record(
     contains the fields, contacts, health and events as ROS 2 messages. If the command is
     killed, at most the last second of the recording is lost. A recording made with --listen contains no
     baselines and can therefore be used only with CAN tools, not to compute fields. The exit status is 1 if
-    frames could not be written or a fault occurred that `skinnode host` reports, and 2 if the hand could not
-    be run.
+    frames could not be written or if a fault occurred that `skinnode host` would report, and 2 if the hand
+    could not be run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal

@@ -70,12 +70,12 @@ def resolve(
     """Solve recordings again, with other options or calibrations, and compare the results.
 
     The results are bit-identical to a replay with these options, regardless of the number of processes. The
-    fields of a recording go into one file, like those of `skinnode convert`. If an option has several values,
-    every combination is solved, and a table compares the results. To resume after an interruption, run the
-    same command again; lost workers do not affect the results.
+    fields of each recording are written to one file, in the same format as by `skinnode convert`. If an
+    option has several values, every combination is solved, and a table compares the results. To resume after
+    an interruption, run the same command again; lost workers do not affect the results.
 
-    The exit status is 1 if a recording is damaged, incomplete or lacks frames, and 2 if the command could not
-    run.
+    The exit status is 1 if a recording is damaged or incomplete or lacks frames, and 2 if the command could
+    not run.
     """
     from skinnode.config import load_hand
     from skinnode.resolve.part_files import PartFiles

@@ -1,4 +1,4 @@
-"""``skinnode tare [PATCH…]``: makes the current resistances of patches their baseline."""
+"""``skinnode tare [PATCH…]``: sets the baselines of patches to their current resistances."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def tare(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Make the current resistances of patches their baseline R0.
+    """Set the baselines R0 of patches to their current resistances.
 
     Do not touch the skin while the command runs.
 

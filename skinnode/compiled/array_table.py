@@ -142,8 +142,8 @@ class ArrayTable:
     """
 
     table: NDArray[np.int64]
-    """(1 + fields, 4) argument for kernels: a row with the digest of the declaration, then one row with the
-    address and the shape of each field."""
+    """(1 + fields, 4) int64: argument for kernels. The first row contains the digest of the declaration; each
+    of the other rows contains the address and the shape of a field."""
     _fields: ClassVar[tuple[_Field | _Group, ...]] = ()
     _names: ClassVar[frozenset[str]] = frozenset()
     _rows: ClassVar[dict[str, int]] = {}

@@ -66,7 +66,7 @@ class KernelCache:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the compiled code of ``signature``; None if there is no usable file.
+        """Return the compiled code for ``signature``; None if there is no usable file.
 
         Numba's own cache first calls ``target_context.refresh()``. This loads modules that only the compiler
         needs, including scipy.linalg, and takes 0.2 s in every process. The compiler calls ``refresh()``
@@ -95,7 +95,7 @@ class KernelCache:
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Write the compiled code of ``signature`` to the cache, if possible."""
+        """Write the compiled code for ``signature`` to the cache, if possible."""
         if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache excludes these, too
             return
         path = self._path(signature, compiled.codegen)

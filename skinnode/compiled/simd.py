@@ -202,7 +202,7 @@ def drop(_typing: Any, value: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
-    """Return the sum of all lanes, computed pairwise by adding one half of the vector to the other."""
+    """Return the sum of all lanes, computed by repeatedly adding one half of the vector to the other."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         value, width = arguments[0], LANES

@@ -44,9 +44,10 @@ class BusConfig(Table):
     name: Name = "can0"
     """Name of the bus, used in the key ``bus`` of each patch."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
-    """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
+    """Name of the interface in python-can, such as socketcan, pcan, kvaser or udp_multicast."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
-    """Name of the channel in python-can: ``can0`` for socketcan, a group address for udp_multicast, ..."""
+    """Name of the channel in python-can, such as ``can0`` for socketcan or a group address for
+    udp_multicast."""
     bitrate_bps: Annotated[
         int,
         Field(ge=10_000, le=1_000_000),

@@ -1,6 +1,6 @@
 """Converts pydantic validation errors to one-line errors with key, value found, values allowed and position.
 
-Pydantic does not know the position of a key in its file. Its messages name Python types ("Input should be a
+Pydantic does not know the position of a key in the file. Its messages name Python types ("Input should be a
 valid integer") instead of the allowed range of values.
 """
 

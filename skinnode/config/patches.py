@@ -191,7 +191,7 @@ class PatchConfig(Table):
     hand file."""
     layout: LayoutConfig = LayoutConfig()
     code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
-    """Width of a resistance code on the bus, bits."""
+    """Width of a resistance code on the bus, in bits."""
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )

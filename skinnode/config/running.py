@@ -59,7 +59,7 @@ class SolverConfig(Table):
         Field(ge=1e-6, le=1e4, allow_inf_nan=False),
         Allowed("a number from 1e-6 to 1e4 (1/h)"),
     ] = 0.1
-    """Accepted number of false touch reports per patch and hour that are caused by noise alone."""
+    """Accepted number of false touches caused by noise alone, per patch and hour."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel. If None, the host uses one thread per core, but at
     most one per patch."""

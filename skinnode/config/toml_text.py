@@ -18,7 +18,7 @@ from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.files.input_file import read_input
 
 KeyPath = tuple[int | str, ...]
-"""Path of a key: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
+"""Path of a key: ``patches[1].node_id`` is represented as ``("patches", 1, "node_id")``."""
 
 _GAP: Final = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 _SPACE: Final = re.compile(r"[ \t]*")

@@ -46,7 +46,7 @@ class Case:
     """Area and number of the case, such as ``SDO-07``."""
     title: str
     clause: str
-    """Clause of CiA 301 v4.2.0 that the case checks, or of another document if one is named."""
+    """Clause that the case checks, of CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property

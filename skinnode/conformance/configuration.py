@@ -22,7 +22,7 @@ because writing any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all rw objects of fixed length, except 0x1003, 0x1010 and 0x1011."""
+    """Read all fixed-length rw objects, except 0x1003, 0x1010 and 0x1011."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):

@@ -130,7 +130,7 @@ class Eds:
     source: str
     """File name or other origin of the EDS, for messages."""
     device: Mapping[str, str]
-    """Options of section DeviceInfo, with keys in lower case."""
+    """Options in the DeviceInfo section, with keys in lower case."""
     dummies: frozenset[int]
     """Data types that may be mapped as dummy entries (section DummyUsage)."""
     entries: Mapping[tuple[int, int], EdsEntry]
@@ -150,7 +150,7 @@ class Eds:
         return (entry for key, entry in self.entries.items() if first <= key[0] <= last)
 
     def indices(self, first: int, last: int) -> list[int]:
-        """Return the indices from ``first`` to ``last`` at which there is an object."""
+        """Return the indices of all objects from ``first`` to ``last``."""
         return sorted({index for index, _ in self.entries if first <= index <= last})
 
 
@@ -186,7 +186,7 @@ def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
         key: Option or key that specifies the file, for messages.
 
     Returns:
-        The EDS and the text of the file. The ``source`` of the EDS states a non-ASCII encoding.
+        The EDS and the text of the file. If the encoding is not ASCII, the ``source`` of the EDS names it.
 
     Raises:
         ConfigError: The file cannot be read.

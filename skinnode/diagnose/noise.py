@@ -1,10 +1,10 @@
 """Estimates the noise of each crossing and of each wire, even while the skin is being touched.
 
-The noise of a crossing is the smaller of two estimates. A touch can only increase them. The first estimate
-uses the second differences of successive scans, whose variance is 6 σ²; it is insensitive to slow touches.
-The second estimate is the part of a crossing's signal that the signals of other wires do not explain; it is
-insensitive to quick touches. It relies on the fact that a touch changes all crossings by linear combinations
-of a few functions of time, whereas noise is independent at each crossing.
+The noise of a crossing is the smaller of two estimates. A touch can only increase these estimates. The first
+estimate uses the second differences of successive scans, whose variance is 6 σ²; it is insensitive to slow
+touches. The second estimate is the part of a crossing's signal that the signals of other wires do not
+explain; it is insensitive to quick touches. It relies on the fact that a touch changes all crossings by
+linear combinations of a few functions of time, whereas noise is independent at each crossing.
 
 A touch that is quick, deep and small increases both estimates, but hardly affects the smallest singular
 values of a wire's signals. These values determine the noise of the wires and of the whole patch while the
@@ -24,7 +24,7 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans for a noise analysis. With fewer scans, the error of the estimated standard
+"""Minimum number of scans for a noise analysis. With fewer scans, the error in the estimated standard
 deviation exceeds 25 %."""
 
 _MOST_SCANS: Final = 64
@@ -175,7 +175,7 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return the scan and the height of each crossing's largest jump, and a mask of the lasting jumps.
+    """Return the scan and height of each crossing's largest jump, and a mask of the lasting jumps.
 
     A jump is lasting if the medians before and after it differ by its height, and if the signal is otherwise
     nearly constant.

@@ -114,9 +114,9 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of the SYNC that started a scan, ns; None if it was not received.
+        """Return the time of the SYNC that started a scan, in ns; None if the SYNC was not received.
 
-        This is the last SYNC before the first frame of the scan that has the scan's counter or no counter.
+        This is the last SYNC, with the scan's counter or no counter, before the first frame of the scan.
         """
         for t_ns, number in reversed(list(self.syncs)):  # copied, because another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:

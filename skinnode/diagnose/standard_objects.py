@@ -88,7 +88,8 @@ _MANY: Final = (
 SINGLE: Final = tuple(_ONE)
 """Indices of the objects that a device has only once, if at all."""
 SERIES: Final = tuple(indices for indices, _ in _MANY)
-"""Index ranges of the objects that a device may have several times. A device uses the first indices."""
+"""Index ranges of the objects that a device may have several times. A device uses the lowest indices of a
+range."""
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:

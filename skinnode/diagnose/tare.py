@@ -53,7 +53,7 @@ class Tared:
     crossings: int = 0
     """Number of crossings with a new R0."""
     median_ohm: float | None = None
-    """Median of the new R0 values, ohm."""
+    """Median of the new R0 values, in ohms."""
     median_change: float | None = None
     """Median of (new R0 / old R0) − 1; None if there were no old R0 values."""
 
@@ -144,7 +144,7 @@ def _runs(connection: BusConnection, node_id: int) -> bool:
 
 
 def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the (U, K) baseline R0, ohm. An upload interrupted by another client is repeated.
+    """Read the (U, K) baseline R0 in ohms. An upload interrupted by another client is repeated.
 
     Raises NodeError if all attempts fail, or if the data have the wrong size.
     """

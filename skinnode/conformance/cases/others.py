@@ -26,7 +26,7 @@ RESTRICTED = (
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Change 0x1015 and 0x1017; return the old values and the new values, by index."""
+    """Change 0x1015 and 0x1017; return the old and the new values, by index."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -180,7 +180,7 @@ def restricted(dut: Dut) -> None:
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
-    """Yield the index and sub-index of each writable COB-ID: SYNC, TIME, EMCY, first RPDO and first TPDO."""
+    """Yield index and sub-index of each writable COB-ID among SYNC, TIME, EMCY, first RPDO and first TPDO."""
     pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
     for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
         entry = dut.eds.find(index, subindex)

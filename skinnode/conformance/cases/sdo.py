@@ -31,7 +31,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry for which ``fits`` is true, except objects that accept only certain values.
+    """Return the first entry for which ``fits`` is true, excluding the objects in ``_SPECIAL``.
 
     Raises NotApplicable if there is none; ``lack`` describes the missing object in the message.
     """
@@ -42,7 +42,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """Return a readable object longer than four bytes (preferably the device name) and its value."""
+    """Return a readable object longer than four bytes, preferably a device name or version, and its value."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):

@@ -57,7 +57,7 @@ class KernelCache:
         file = inspect.getfile(function)
         self._folder = folder
         self._stem = f"{Path(file).stem}.{function.__qualname__}-{code.co_firstlineno}"
-        # without the path of the file, so that installations of the same code share their kernels
+        # excludes the file's path, so that installations of the same code share their kernels
         self._source = (sys.implementation.cache_tag, _file_digest(file), code.co_code.hex())
 
     @property
@@ -129,7 +129,7 @@ def _file_digest(file: str) -> str:
 
 
 def _read(path: Path) -> bytes:
-    """Return the payload of a file. Raises OSError if it cannot be read, ValueError if it is damaged."""
+    """Return the payload of a file. Raises OSError if it cannot be read, or ValueError if it is damaged."""
     if not stat.S_ISREG(path.stat().st_mode):  # opening a named pipe could block forever
         raise ValueError("not a file")
     data = path.read_bytes()

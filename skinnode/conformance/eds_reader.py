@@ -263,7 +263,7 @@ def _entries(
                 _object(entries, index, sections[title], found)
         except (ValueError, KeyError) as error:
             found.append(f"[{title}]: {error}")
-        if len(entries) > _MOST_ENTRIES:  # with CompactSubObj, 60 characters declare 255 entries
+        if len(entries) > _MOST_ENTRIES:  # with CompactSubObj, 60 characters can declare 255 entries
             got = Shown(f"more than {_MOST_ENTRIES} values in the sections up to {title}")
             raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
     return entries, found

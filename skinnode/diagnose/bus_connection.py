@@ -149,7 +149,7 @@ class BusConnection(Closing):
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Read the heartbeat period of a node (0x1017), s; 0 if disabled, None if it cannot be read."""
+        """Read a node's heartbeat period (0x1017) in seconds; 0 if disabled, None if it cannot be read."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:

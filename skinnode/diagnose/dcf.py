@@ -2,8 +2,8 @@
 
 Numbers and printable ASCII strings are written to ``ParameterValue`` as CiA 306 specifies, and values of type
 OCTET_STRING or DOMAIN are written there in hexadecimal. CiA 306 has no notation for other strings: INI
-readers would change non-ASCII characters, leading or trailing blanks, and comment signs. The bytes of such a
-string are written as a comment, which :func:`expected` reads and other tools skip::
+readers would change non-ASCII characters, leading or trailing blanks, and comment characters. The bytes of
+such a string are written as a comment, which :func:`expected` reads and other tools skip::
 
     ;ParameterBytes=63 61 66 c3 a9
 """
@@ -117,7 +117,7 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
 
 
 def _is_configuration(reading: Reading) -> bool:
-    """Return whether the object is part of the configuration that a tool downloads from a DCF."""
+    """Return whether the object is part of the configuration that a tool downloads from a DCF to a node."""
     measured = reading.index in (*NOT_CONFIGURATION, od.BASELINE_DOMAIN)
     command = (reading.index, reading.subindex) in od.COMMANDS
     return reading.access in ("rw", "rww", "rwr") and not measured and not command

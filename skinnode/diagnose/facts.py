@@ -112,7 +112,7 @@ class BusFacts:
     channel: str
     bitrate_bps: int
     failure: str = ""
-    """Reason why the bus could not be opened or failed later; empty if it works."""
+    """Reason why the bus could not be opened or later failed; empty if it works."""
     link_state: str | None = None
     """State of the CAN controller reported by the kernel, such as ``ERROR-ACTIVE``."""
     link_bitrate_bps: int | None = None

@@ -92,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """Determine a node's state and settings before the command; a stopped node does not answer SDO."""
+    """Determine a node's state and settings before the command; stopped nodes do not answer SDO requests."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)

@@ -1,4 +1,4 @@
-"""Conformance cases TRANS-01 to TRANS-04: NMT transitions on reset, pre-operational, start, and stop."""
+"""Conformance cases TRANS-01 to TRANS-04: NMT state transitions on reset, pre-operational, start and stop."""
 
 from __future__ import annotations
 

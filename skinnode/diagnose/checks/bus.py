@@ -18,7 +18,7 @@ _ASTRAY: Final = 0.25
 """Fraction of out-of-sequence SYNC counters above which a second SYNC producer is reported.
 
 With two producers, about half of the counters do not follow the previous one. Lost SYNCs cause far fewer such
-gaps.
+counters.
 """
 
 _BEATS: Final = 4

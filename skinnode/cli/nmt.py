@@ -45,8 +45,8 @@ def nmt(
 
     `all` means every node on the bus or, with --hand, on every bus of the hand.
 
-    The exit status is 0 if every node entered the commanded state, 1 if any did not, 2 if the command could
-    not run.
+    The exit status is 0 if every node entered the commanded state, 1 if any did not, and 2 if the command
+    could not run.
     """
     from skinnode.cli._bus import find_buses, find_node
     from skinnode.cli._console import console, print_json, progress, table

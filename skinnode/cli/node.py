@@ -1,4 +1,4 @@
-"""``skinnode node``: runs a Linux board with a converter as a skin patch on a CAN bus."""
+"""``skinnode node``: runs a Linux board with an A/D converter as a skin patch on a CAN bus."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def node(
         int, typer.Option(min=10_000, max=1_000_000, help="Bits per second.", metavar="BPS")
     ] = 1_000_000,
     fd: Annotated[
-        bool, typer.Option("--fd", help="Send PDOs in CAN FD frames with bit-rate switch.")
+        bool, typer.Option("--fd", help="Send PDOs in CAN FD frames with bit-rate switching.")
     ] = False,
     data_bitrate: Annotated[
         int, typer.Option(min=10_000, max=8_000_000, help="Data bit rate of CAN FD frames.", metavar="BPS")
@@ -74,11 +74,11 @@ def node(
 ) -> None:
     """Run one patch as a CANopen node that sends the resistances read from a source.
 
-    A source is a class or function that takes the layout and returns an object whose read(t_ns) returns
-    the (U, K) resistances in ohms. `--source simulated` needs no hardware. The command reports every second
-    until Ctrl-C. The exit status is 1 if the source failed, scans were skipped, frames were not sent,
-    another node used the same node-ID, or the --store file could not be used. The exit status is 2 if the
-    node could not run.
+    A source is a class or function that takes the layout and returns an object whose read(t_ns) method
+    returns the (U, K) resistances in ohms. `--source simulated` needs no hardware. The command prints its
+    counters every second until you press Ctrl-C. The exit status is 1 if the source failed, scans were
+    skipped, frames were not sent, another node used the same node-ID, or the --store file could not be used.
+    The exit status is 2 if the node could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here
@@ -136,7 +136,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Lock the file ``store``, and yield the non-volatile memory that it contains."""
+    """Lock the file ``store`` and yield the non-volatile memory stored in it."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory_file import FileMemory
@@ -172,7 +172,7 @@ def _node_text(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Counters of a running node, all 0 when the node starts."""
+    """Status and counters of a running node; the counters start at 0."""
 
     elapsed_s: float
     node_id: int | None
@@ -229,7 +229,7 @@ def _faults(end: _Progress) -> list[str]:
 def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """Print a line every second until the command is stopped, the duration has elapsed or the node ends."""
+    """Print a line every second until the command is stopped, the duration has elapsed or the node stops."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0

@@ -57,8 +57,8 @@ def od(
 ) -> None:
     """Read or write objects of a node. Indices are hexadecimal, with or without 0x.
 
-    Without INDEX, the command dumps the whole dictionary. The exit status is 0 on success, 1 if --diff
-    found differences, 2 if the node did not answer or refused the request.
+    Without INDEX, the command dumps the whole dictionary. The exit status is 0 on success, 1 if --diff found
+    differences, and 2 if the node did not answer or refused the request.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
@@ -99,14 +99,14 @@ def od(
 def _require_combination(
     where: tuple[int, int | None] | None, write: str | None, dcf: Path | None, diff: Path | None
 ) -> None:
-    """Raise ConfigError if mutually exclusive options are given."""
+    """Raise ConfigError if the options conflict."""
     from skinnode.errors import ConfigError
 
     if write is not None and where is None:
         raise ConfigError("--write", write, "only with INDEX[:SUB]")
     if diff is not None and (where is not None or write is not None or dcf is not None):
         raise ConfigError(
-            "--diff", str(diff), "only without these options, because it compares the whole dictionary"
+            "--diff", str(diff), "without INDEX, --write and --dcf, because it compares the whole dictionary"
         )
     if dcf is not None and where is not None:
         raise ConfigError("--dcf", str(dcf), "only without INDEX, because it covers the whole dictionary")
@@ -132,7 +132,7 @@ def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
 
 
 def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
-    """Read the whole dictionary: the objects in the EDS or, without an EDS, the objects of CiA 301."""
+    """Read the whole dictionary: the objects in the EDS or, without an EDS, those defined by CiA 301."""
     from skinnode.diagnose.object_dictionary import dump, dump_standard
 
     return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
@@ -163,7 +163,7 @@ def _note(sheet: DataSheet) -> None:
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the EDS of the node.
 
-    The EDS has no entries for a third-party device without an EDS file, or if the node refuses to identify
+    The EDS is empty if no EDS file is given for a third-party device, or if the node refuses to identify
     itself. Objects then have only their CiA 301 names.
     """
     from skinnode.conformance.eds_reader import Eds
@@ -184,7 +184,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
     """Read the objects.
 
-    A refused read raises SdoAbort if it is the only one; among several, it is listed with the results.
+    A refused read raises SdoAbort if only one object is read; otherwise, it is listed with the results.
     """
     from skinnode.diagnose.object_dictionary import read_entry
 

@@ -55,8 +55,8 @@ def record(
     contains the fields, contacts, health and events as ROS 2 messages. If the command is
     killed, at most the last second of the recording is lost. A recording made with --listen contains no
     baselines and can therefore be used only with CAN tools, not to compute fields. The exit status is 1 if
-    frames could not be written or a fault occurred that `skinnode host` reports, 2 if the hand could not be
-    run.
+    frames could not be written or if a fault occurred that `skinnode host` would report, and 2 if the hand
+    could not be run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
@@ -97,7 +97,8 @@ def _run(
             faults, notes = faults_and_notes(running)
             skipped = {name: stream.skipped for name, stream in running.stats().patches.items()}
             notes += [
-                f"{name}: {counted(count, 'scan')} skipped for newer ones; their frames were recorded"
+                f"{name}: {counted(count, 'scan')} skipped in favour of newer scans; "
+                "their frames were recorded"
                 for name, count in skipped.items()
                 if count
             ]
@@ -138,7 +139,7 @@ def _follow(
 ) -> None:
     """Print a line every second until the command is stopped or the duration has elapsed.
 
-    ``check`` is called before each line; its exceptions are propagated.
+    ``check`` is called before each line is printed; its exceptions propagate.
     """
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds

@@ -26,7 +26,7 @@ def replay(
         Path | None,
         typer.Option(
             "--hand",
-            help="Hand file for a log without a journal, such as a candump log of another master.",
+            help="Hand file for a log without a journal, such as a candump log from another master.",
             metavar="HAND.toml",
         ),
     ] = None,
@@ -41,15 +41,15 @@ def replay(
         ),
     ] = False,
 ) -> None:
-    """Decode and solve a recording made by `skinnode record`; results are bit-identical to the live run's.
+    """Decode and solve a recording made by `skinnode record`; results are bit-identical to the live run.
 
-    With --hand, decode a log that another program recorded. Its scans are solved with the layouts and
-    baselines of the hand file, and the first scans may lack the history that a host would have.
+    With --hand, decode a log recorded by another program. Its scans are solved with the layouts and baselines
+    from the hand file; the first scans may lack history that a live host would have had.
 
     With --json, each field has `contacts`: centroid, area, normal and shear force with standard deviations,
     in m, m² and N.
 
-    The exit status is 1 if the recording is damaged, was not ended properly, lacks frames or contains error
+    The exit status is 1 if the recording is damaged, was not closed properly, lacks frames or contains error
     frames. The exit status is also 1 if a scan was torn or missed, or if a chunk or summary was lost. The
     exit status is 2 if the recording cannot be read.
     """

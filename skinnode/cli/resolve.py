@@ -1,4 +1,4 @@
-"""``skinnode resolve RECORDING…``: solves recordings again with other options, on several processes."""
+"""``skinnode resolve RECORDING…``: solves recordings again with other options, in several processes."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def resolve(
         list[str] | None,
         typer.Option(
             "--set",
-            help="Option that replaces the recorded one: a key of the hand file, solver.KEY or "
-            "patches.NAME.KEY, where NAME can be *. Several values, separated by commas, are tried in turn.",
+            help="Override a recorded option: a key of the hand file, solver.KEY or "
+            "patches.NAME.KEY, where NAME can be *. Several comma-separated values are tried in turn.",
             metavar="KEY=VALUE[,VALUE...]",
         ),
     ] = None,
@@ -45,7 +45,7 @@ def resolve(
         Path | None,
         typer.Option(
             "--hand",
-            help="Hand file for logs without a journal, such as candump logs of another master.",
+            help="Hand file for logs without a journal, such as candump logs from another master.",
             metavar="HAND.toml",
         ),
     ] = None,
@@ -69,13 +69,13 @@ def resolve(
 ) -> None:
     """Solve recordings again, with other options or calibrations, and compare the results.
 
-    The results are those of a replay with these options, bit for bit, whatever the number of processes. The
-    fields of a recording go into one file, like those of `skinnode convert`. With several values of an
-    option, every combination is solved, and a table compares them. If the command is interrupted, the same
-    command continues; lost workers change nothing.
+    The results are bit-identical to a replay with these options, regardless of the number of processes. The
+    fields of each recording are written to one file, in the same format as by `skinnode convert`. If an
+    option has several values, every combination is solved, and a table compares the results. To resume after
+    an interruption, run the same command again; lost workers do not affect the results.
 
-    The exit status is 1 if a recording is damaged, incomplete or lacks frames, and 2 if the command could not
-    run.
+    The exit status is 1 if a recording is damaged or incomplete or lacks frames, and 2 if the command could
+    not run.
     """
     from skinnode.config import load_hand
     from skinnode.resolve.part_files import PartFiles
@@ -101,7 +101,7 @@ def resolve(
 
 
 def _check(kind: str, processes: int | None, scheduler: str | None) -> None:
-    """Check, before any work, that the options fit together and that the packages are installed."""
+    """Check in advance that the options are compatible and that the required packages are installed."""
     from skinnode.errors import ConfigError
     from skinnode.messages.typestore import require_mcap
     from skinnode.record.parquet_file import require_pyarrow
@@ -131,7 +131,7 @@ def _workers(processes: int | None, scheduler: str | None, folder: Path) -> Any:
 
 @contextmanager
 def _bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Yield a function that shows the progress on stderr, if it is a terminal."""
+    """Yield a function that shows the progress on stderr if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield lambda done, total, newest: None
         return

@@ -1,4 +1,4 @@
-"""``skinnode tare [PATCH…]``: makes the current resistances of patches their baseline."""
+"""``skinnode tare [PATCH…]``: sets the baselines of patches to their current resistances."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def tare(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Make the current resistances of patches their baseline R0.
+    """Set the baselines R0 of patches to their current resistances.
 
     Do not touch the skin while the command runs.
 
     Taring uses SDO and works with or without a host on the bus; a running host reads the new baselines
     and continues. A baseline is lost at power-off unless it is stored (0x1010). The command refuses to tare a
     patch whose baseline is a file named in hand.toml. The exit status is 0 if every patch was tared, 1 if any
-    was not, 2 if the command could not run.
+    was not, and 2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses, node_among
     from skinnode.cli._console import print_json, progress
@@ -75,7 +75,7 @@ def tare(
 
 
 def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
-    """Tare the nodes on one bus. The bus is opened only if at least one of the nodes may be tared."""
+    """Tare the nodes on one bus. The bus is opened only if at least one of the nodes can be tared."""
     from skinnode.diagnose.bus_connection import BusConnection
     from skinnode.diagnose.tare import Tared, refusal, tare
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from skinnode.view.viewer_process import ViewerProcess
 
 _LOOK_S = 0.1
-"""Interval between checks of the viewer, s."""
+"""Interval at which the viewer is checked, s."""
 _PORTS = 65_534
 
 
@@ -60,39 +60,39 @@ def view(
     address: Annotated[
         str | None,
         typer.Option(
-            help="Address on which --web listens; default 127.0.0.1, which only this machine reaches.",
+            help="Address on which --web listens; default 127.0.0.1, which only this machine can reach.",
             metavar="IP",
         ),
     ] = None,
     port: Annotated[
         int | None,
         typer.Option(
-            min=1, max=_PORTS, help="Port of --web; default 9090. The next port is used too.", metavar="PORT"
+            min=1, max=_PORTS, help="Port for --web; default 9090. The next port is used too.", metavar="PORT"
         ),
     ] = None,
     save: Annotated[
         str | None,
         typer.Option(
-            help="Write a new file that `rerun FILE.rrd` shows; without a window.", metavar="FILE.rrd"
+            help="Write a new file for `rerun FILE.rrd` instead of opening a window.", metavar="FILE.rrd"
         ),
     ] = None,
     rate: Annotated[
         float,
-        typer.Option(min=0.1, max=1000.0, help="Maximum pictures of a patch per second.", metavar="HZ"),
+        typer.Option(min=0.1, max=1000.0, help="Maximum drawing rate of each patch, in Hz.", metavar="HZ"),
     ] = 30.0,
     exaggerate: Annotated[
         float,
-        typer.Option(min=0.0, max=1000.0, help="Draw displacements this many times enlarged.", metavar="X"),
+        typer.Option(min=0.0, max=1000.0, help="Factor by which to enlarge displacements.", metavar="X"),
     ] = 10.0,
     seconds: Seconds = None,
 ) -> None:
-    """Show a hand in 3-D: pressed surfaces, shear, contacts and forces, health, events, curves over time.
+    """Show a hand in 3-D: pressed surfaces, shear, contacts and forces, health, events and plots over time.
 
     The command runs the hand like `skinnode host`, but waits for missing patches. With neither --web nor
     --save, it opens a window and ends when the window is closed. With only --replay and --save, it converts
     the whole recording as fast as possible. Requires the optional packages of the `view` extra. The exit
-    status is 0 if no fault occurred, 1 if any fault occurred (faults are printed at the end), and 2 if the
-    command could not run.
+    status is 0 if no fault occurred, 1 if any fault occurred (the faults are printed at the end), and 2 if
+    the command could not run.
     """
     from skinnode.errors import ConfigError
 
@@ -141,12 +141,12 @@ def _require_viewer() -> None:
 
 
 def _open(stack: ExitStack, options: OutputOptions) -> Output:
-    """Open the output; called before the hand is opened, so a port in use is reported immediately."""
+    """Open the output; called before the hand is opened, so that a port in use is reported immediately."""
     from skinnode.view.outputs import open_output
 
     output = stack.enter_context(open_output(options))
     if output.page_url is not None:
-        print(f"open {output.page_url} in a browser; Ctrl-C ends", flush=True)
+        print(f"open {output.page_url} in a browser; press Ctrl-C to stop", flush=True)
     return output
 
 
@@ -194,7 +194,7 @@ def _show(
     stop: threading.Event,
     drawing: _Drawing,
 ) -> tuple[list[str], DrawnCounts]:
-    """Draw a source until the drawing ends; return the faults and the field counts."""
+    """Draw the source's fields until drawing stops; return the faults and the field counts."""
     from skinnode.view.drawing_thread import DrawingThread
 
     with DrawingThread(source, process.draw, rate_hz=drawing.rate_hz) as thread:
@@ -209,7 +209,7 @@ def _show(
 def _wait(
     source: Source, output: Output, thread: DrawingThread, stop: threading.Event, seconds: float | None
 ) -> None:
-    """Wait until the user, the time limit, the viewer, an error or the recording's end ends the drawing."""
+    """Wait until the user, the time limit, the viewer, an error or the end of the recording stops drawing."""
     import time
 
     end_s = None if seconds is None else time.monotonic() + seconds
@@ -221,7 +221,7 @@ def _wait(
             return
         if source.over and not over:
             over = True
-            print("end of the recording; Ctrl-C ends", flush=True)
+            print("end of the recording; press Ctrl-C to stop", flush=True)
         if output.viewer is not None and output.viewer.ended:
             if output.page_url is None and output.viewer.closed:  # by the user
                 return
@@ -248,7 +248,7 @@ def _convert(
 
 def _report(faults: list[str], counts: DrawnCounts) -> None:
     print(
-        f"{counts.drawn} fields drawn, {counts.left_out} left out for newer ones, "
+        f"{counts.drawn} fields drawn, {counts.left_out} left out in favour of newer fields, "
         f"{counts.dropped} dropped because drawing was too slow"
     )
     for fault in faults:

@@ -72,7 +72,7 @@ class _Field:
         return kind if self.axes is None else types.Array(kind, len(self.axes), "C", readonly=self.readonly)
 
     def check(self, table: str, array: Any, lengths: dict[str, int]) -> None:
-        """Raise TypeError unless ``array`` fits the declaration and the known axis ``lengths``."""
+        """Raise TypeError unless ``array`` matches the declaration and the known axis ``lengths``."""
         assert self.axes is not None
         if not isinstance(array, np.ndarray):
             raise TypeError(f"{table}.{self.name}: got {type(array).__name__}, {self._wanted()}")
@@ -98,7 +98,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Group:
-    """Several fields declared as a NamedTuple, which kernels read as one tuple."""
+    """Group of fields declared as a NamedTuple, which kernels read as a tuple."""
 
     name: str
     made_of: type
@@ -142,8 +142,8 @@ class ArrayTable:
     """
 
     table: NDArray[np.int64]
-    """(1 + fields, 4) argument for kernels: a row with the digest of the declaration, then one row with the
-    address and the shape of each field."""
+    """(1 + fields, 4) int64: argument for kernels. The first row contains the digest of the declaration; each
+    of the other rows contains the address and the shape of a field."""
     _fields: ClassVar[tuple[_Field | _Group, ...]] = ()
     _names: ClassVar[frozenset[str]] = frozenset()
     _rows: ClassVar[dict[str, int]] = {}
@@ -216,7 +216,7 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Return a function with which kernels access the fields of a table by name.
+    """Return a function that kernels use to access the fields of a table by name.
 
     The function can only be called in compiled code. It raises TypeError if the table does not belong to
     ``made_of``. Each access to a field reads the table again, so access fields outside loops. In kernels,

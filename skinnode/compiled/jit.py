@@ -1,14 +1,14 @@
-"""Decorators that compile kernels and cache them without the risk of stale code.
+"""Decorators that compile kernels and cache them without risking stale code.
 
-Numba's own cache misses changes in other files whose functions a kernel calls. The name of the cache folder
-(:mod:`skinnode.compiled.kernel_cache`) therefore contains a digest of all files with kernels, and a change in
-any of them recompiles all kernels. The folder is created in ``$SKINNODE_CACHE_DIR``, in the user's cache
-folder or in the system's temporary folder, whichever is writable first. If none is writable, kernels are not
-cached.
+Numba's own cache does not notice changes in other files whose functions a kernel calls. The name of the cache
+folder (:mod:`skinnode.compiled.kernel_cache`) therefore contains a digest of all files with kernels, and a
+change in any of them recompiles all kernels. The folder is created in ``$SKINNODE_CACHE_DIR``, in the user's
+cache folder or in the system's temporary folder, whichever is writable first. If none is writable, kernels
+are not cached.
 
-Kernels are compiled with ``error_model="numpy"``, so that a division by zero yields inf and no exception.
-Most are also compiled with ``nogil``, so that several threads can solve patches in parallel. ``fastmath`` is
-off, because it would allow the compiler to reorder sums.
+Kernels are compiled with ``error_model="numpy"``, so that division by zero yields inf instead of raising an
+exception. Most are also compiled with ``nogil``, so that several threads can solve patches in parallel.
+``fastmath`` is off, because it would allow the compiler to reorder sums.
 """
 
 from __future__ import annotations
@@ -84,8 +84,7 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 def njit_part(function: _F) -> _F:
     """Compile ``function`` for use by other kernels; it is cached as part of their code.
 
-    Python cannot call the compiled function. Without the entry point for Python, the compile time is a fifth
-    shorter.
+    Python cannot call the compiled function. Omitting the Python entry point shortens compilation by a fifth.
     """
     compiled: _F = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
     return compiled

@@ -7,7 +7,8 @@ so two processes that compile different signatures at the same time can mix up t
 This cache has a separate file for each compiled signature. The file contains a magic number, the SHA-256 of
 the payload, and the payload. Its name contains a digest of all inputs of the compilation, so that no index is
 needed. Files are replaced atomically. A file that fails the check is removed, and the kernel is compiled
-again. This event, or a failure to write a file, is logged in one line; no error reaches the caller.
+again. The removal of a file, or a failure to write one, is logged in one line; no exception reaches the
+caller.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class KernelCache:
         file = inspect.getfile(function)
         self._folder = folder
         self._stem = f"{Path(file).stem}.{function.__qualname__}-{code.co_firstlineno}"
-        # without the path of the file, so that installations of the same code share their kernels
+        # excludes the file's path, so that installations of the same code share their kernels
         self._source = (sys.implementation.cache_tag, _file_digest(file), code.co_code.hex())
 
     @property
@@ -65,10 +66,11 @@ class KernelCache:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the compiled code of ``signature``; None if there is no usable file.
+        """Return the compiled code for ``signature``; None if there is no usable file.
 
-        Numba's own cache first calls ``target_context.refresh()``. This loads all that only the compiler
-        needs, including scipy.linalg, and takes 0.2 s in every process. The compiler calls it itself.
+        Numba's own cache first calls ``target_context.refresh()``. This loads modules that only the compiler
+        needs, including scipy.linalg, and takes 0.2 s in every process. The compiler calls ``refresh()``
+        itself.
         """
         path = self._path(signature, target_context.codegen())
         try:
@@ -93,7 +95,7 @@ class KernelCache:
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Write the compiled code of ``signature`` to the cache, if possible."""
+        """Write the compiled code for ``signature`` to the cache, if possible."""
         if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache excludes these, too
             return
         path = self._path(signature, compiled.codegen)
@@ -103,7 +105,7 @@ class KernelCache:
             reason = error.strerror or type(error).__name__
             _report(
                 self._folder,
-                f"a compiled kernel could not be cached ({reason}); it is recompiled at the next start",
+                f"a compiled kernel could not be cached ({reason}); it will be recompiled at the next start",
             )
 
     def enable(self) -> None:
@@ -127,7 +129,7 @@ def _file_digest(file: str) -> str:
 
 
 def _read(path: Path) -> bytes:
-    """Return the payload of a file. Raises OSError if it cannot be read, ValueError if it is damaged."""
+    """Return the payload of a file. Raises OSError if it cannot be read, or ValueError if it is damaged."""
     if not stat.S_ISREG(path.stat().st_mode):  # opening a named pipe could block forever
         raise ValueError("not a file")
     data = path.read_bytes()
@@ -142,9 +144,9 @@ def _write(path: Path, payload: bytes) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Remove all damaged files in ``folder`` at once, and log them in one line.
+    """Remove all damaged files in ``folder`` and log a single line about them.
 
-    If several processes find damaged files at the same time, only one of them removes and logs them.
+    If several processes find damaged files at the same time, only one process removes and logs the files.
     """
     with _locked(folder):
         files = list(folder.glob(f"*{SUFFIX}"))
@@ -196,7 +198,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log a warning about the cache, but only once per process, folder and kind of message."""
+    """Log a warning about the cache, at most once per process, folder and kind of message."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

@@ -2,9 +2,10 @@
 
 Automatic vectorisation falls short in several ways: LLVM prefers 256-bit vectors even where 512-bit vectors
 are twice as fast, vectorises only if it can prove that arrays do not overlap, and may keep sums in memory
-instead of registers. With this module, a kernel states its vector operations itself. Each lane accumulates
-its own sum in the order of the source code, so the result does not depend on the number of threads or on how
-columns are distributed. On processors with vectors of fewer than LANES doubles, LLVM splits each operation.
+instead of registers. With this module, a kernel specifies its vector operations explicitly. Each lane
+accumulates its own sum in the order of the source code, so the result does not depend on the number of
+threads or on how columns are distributed. On processors whose vectors hold fewer than LANES doubles, LLVM
+splits each operation.
 
 Vectors support +, − and *. A double in such an expression is broadcast to all lanes.
 """
@@ -128,12 +129,12 @@ _binary(operator.mul, operator.imul, "fmul")
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
-    """Load up to LANES elements of a row into a vector; lanes from ``count`` on are 0.
+    """Load up to LANES elements of a row into a vector; lanes with an index of ``count`` or above are 0.
 
     Args:
         row: Contiguous row of float64.
         start: Index of the first element.
-        count: Number of elements to load; values above LANES have the effect of LANES.
+        count: Number of elements to load; values above LANES are treated as LANES.
     """
     _require_row(row)
 
@@ -153,7 +154,7 @@ def store(_typing: Any, row: Any, start: Any, count: Any, value: Any) -> Any:
     Args:
         row: Contiguous row of float64.
         start: Index of the first element.
-        count: Number of lanes to store; values above LANES have the effect of LANES.
+        count: Number of lanes to store; values above LANES are treated as LANES.
         value: The vector.
     """
     _require_row(row)
@@ -180,7 +181,7 @@ def splat(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return a·b + c, rounded only once if the processor has such an instruction."""
+    """Return a·b + c, rounded only once if the processor has a fused multiply-add instruction."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         inputs = [_splat(builder, argument) for argument in arguments]
@@ -201,7 +202,7 @@ def drop(_typing: Any, value: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
-    """Return the sum of all lanes, computed pairwise by adding one half of the vector to the other."""
+    """Return the sum of all lanes, computed by repeatedly adding one half of the vector to the other."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         value, width = arguments[0], LANES

@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default limit of the planned bus load, as a fraction. Above it, the response times of low-priority frames
-grow steeply (Davis, Burns, Bril and Lukkien, Controller Area Network (CAN) schedulability analysis, Real-Time
-Systems 35, 2007), and too little capacity is left to repeat frames after errors."""
+"""Default limit for the planned bus load, as a fraction. Above this limit, the response times of low-priority
+frames grow steeply (Davis, Burns, Bril and Lukkien, Controller Area Network (CAN) schedulability analysis,
+Real-Time Systems 35, 2007), and too little capacity is left to retransmit frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]
@@ -44,26 +44,27 @@ class BusConfig(Table):
     name: Name = "can0"
     """Name of the bus, used in the key ``bus`` of each patch."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
-    """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
+    """Name of the interface in python-can, such as socketcan, pcan, kvaser or udp_multicast."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
-    """Name of the channel in python-can: ``can0`` for socketcan, a group address for udp_multicast, ..."""
+    """Name of the channel in python-can, such as ``can0`` for socketcan or a group address for
+    udp_multicast."""
     bitrate_bps: Annotated[
         int,
         Field(ge=10_000, le=1_000_000),
         Allowed("an integer from 10000 to 1000000, as in classic CAN"),
     ] = 1_000_000
-    """Bits per second; for CAN FD frames, the bit rate of the arbitration phase."""
+    """Bit rate, bits per second; for CAN FD frames, the bit rate of the arbitration phase."""
     fd: bool = False
     """Send the PDOs of the patches on this bus in CAN FD frames with bit-rate switching."""
     data_bitrate_bps: Annotated[
         int, Field(ge=10_000, le=8_000_000), Allowed("an integer from 10000 to 8000000")
     ] = 5_000_000
-    """Bits per second in the data phase of CAN FD frames, from ESI to the CRC delimiter."""
+    """Bit rate of the data phase of CAN FD frames, from ESI to the CRC delimiter, bits per second."""
     options: dict[str, bool | int | float | str] = Field(default={})
     """Additional keyword arguments for the interface in python-can."""
     role: Annotated[Role, one_of(Role)] = "master"
-    """Role of the host: ``master`` if it sends NMT and SYNC on the bus, ``guest`` if the robot's own master
-    does."""
+    """Role of the host: ``master`` if it sends NMT commands and SYNC on the bus, ``guest`` if the robot's own
+    master does."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
     """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
     the patches and read their data."""

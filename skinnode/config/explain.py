@@ -1,6 +1,6 @@
 """Converts pydantic validation errors to one-line errors with key, value found, values allowed and position.
 
-Pydantic does not know the position of a key in its file. Its messages name Python types ("Input should be a
+Pydantic does not know the position of a key in the file. Its messages name Python types ("Input should be a
 valid integer") instead of the allowed range of values.
 """
 
@@ -55,7 +55,7 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``, or its text truncated to 60 characters if it is longer."""
+    """Return ``value``, or its text truncated to 60 characters if the text is longer."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 

@@ -22,17 +22,17 @@ from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
 MOST_BUSES: Final = 256
-"""Maximum number of buses of a hand; no machine has so many CAN interfaces, but simulated hands of a thousand
+"""Maximum number of buses in a hand. No machine has that many CAN interfaces, but simulated hands with 1000
 patches have 250 buses."""
 
 
 class HandConfig(Table):
-    """Configuration of a hand: its buses and patches, and the settings of the host.
+    """Configuration of a hand: its buses and patches, and the host settings.
 
     Names, node-IDs and serial numbers must be unique, the bus of each patch must exist, each geometry must be
     possible, and no setting may conflict with the role of a bus; otherwise a ConfigError is raised. Pydantic
-    wraps it in a ValidationError, which :func:`parse_hand` unwraps. The bus load is checked separately, by
-    :func:`skinnode.bus_load.plan.check_plan`.
+    wraps this error in a ValidationError, which :func:`parse_hand` unwraps. The bus load is checked
+    separately, by :func:`skinnode.bus_load.plan.check_plan`.
     """
 
     name: Name = "hand"
@@ -79,11 +79,11 @@ class HandConfig(Table):
         return self._read_of.where(key_path(key))
 
     def on(self, interface: str | None = None, channel: str | None = None) -> HandConfig:
-        """Return a copy of the hand that uses another interface or channel.
+        """Return a copy of the hand that uses a different interface or channel.
 
         Args:
-            interface: New python-can interface of all buses; None to keep the interfaces in the file.
-            channel: New channel of the bus; None to keep the channel in the file.
+            interface: New python-can interface for all buses; None to keep the interfaces in the file.
+            channel: New channel for the bus; None to keep the channel in the file.
 
         Raises:
             ConfigError: A channel is given for a hand with several buses, or a name is empty.
@@ -187,7 +187,7 @@ class HandConfig(Table):
 
 
 def load_hand(path: Path | str) -> HandConfig:
-    """Read a hand file. Paths in it are relative to its folder.
+    """Read a hand file. Paths in the file are relative to its folder.
 
     Args:
         path: The file.
@@ -225,7 +225,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raise ConfigError if the geometry is impossible, or if there is not one gain per upper wire."""
+    """Raise ConfigError if the geometry is impossible or the number of upper-wire gains is wrong."""
     try:
         layout = patch.layout.build()
     except ValueError as error:

@@ -21,7 +21,7 @@ _Part = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False), Allowe
 class PoseConfig(Table):
     """Pose of a coordinate frame relative to its parent frame.
 
-    The frame of a patch has x along the upper wires, y across them and z out of the skin.
+    In the frame of a patch, x points along the upper wires, y across them and z out of the skin.
     """
 
     position_m: Annotated[

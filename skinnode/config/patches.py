@@ -69,9 +69,9 @@ class LayoutConfig(Table):
     resistivity_ohm_per_m: _Resistivity = 1e7
     """Resistance of the rubber between two electrodes, divided by their distance, ohm per metre."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
-    """Source of the electrode positions: ``preset`` for this table, or ``node`` if the host reads the
-    positions from the patch (0x2300). Bus-load plans and simulations always use this table, so its numbers of
-    wires and electrodes must be correct."""
+    """Source of the electrode positions: ``preset`` for this table, ``node`` for the patch itself (0x2300).
+    Bus-load plans and simulations always use this table, so its numbers of wires and electrodes must be
+    correct."""
 
     @field_validator("file")
     @classmethod
@@ -107,7 +107,7 @@ class LayoutConfig(Table):
 
 
 class CalibrationConfig(Table):
-    """Measured properties of a patch; baseline and resistivity have keys of their own."""
+    """Measured properties of a patch; the baseline and the resistivity have their own keys."""
 
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
@@ -125,8 +125,8 @@ class CalibrationConfig(Table):
     enough to cover rubber bonded to a rigid support, where the force can be fifty times as high as for thick
     rubber. A modulus from a data sheet is not a calibration."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """Correction factors, one per upper wire. Each factor multiplies the wire's measured resistances and
-    corrects drift since the baseline was measured."""
+    """Correction factors, one per upper wire. Each factor multiplies the wire's measured resistances to
+    correct drift since the baseline was measured."""
 
     @property
     def rubber(self) -> Rubber:
@@ -137,7 +137,7 @@ class CalibrationConfig(Table):
 class TolerancesConfig(Table):
     """Manufacturing tolerances of a patch, which are included in the reported standard deviations.
 
-    `"ordinary"` stands for the defaults below, `"exact"` for a patch that matches its layout exactly, such as
+    `"ordinary"` selects the defaults below; `"exact"` is for a patch that matches its layout exactly, such as
     a simulated patch. The solver method `posterior` includes tolerances in its standard deviations; `exact`
     ignores them. If a patch has tolerances, `auto` selects `posterior`.
     """
@@ -167,7 +167,7 @@ class TolerancesConfig(Table):
 
 
 def _or_named(schema: dict[str, Any]) -> None:
-    """Allow the names of tolerances in the JSON Schema of the key ``tolerances``."""
+    """Allow the names of predefined tolerances in the JSON Schema of the key ``tolerances``."""
     named = {"type": "string", "enum": list(_NAMED_TOLERANCES)}
     schema["anyOf"] = [named, {"$ref": schema.pop("$ref")}]
 
@@ -191,7 +191,7 @@ class PatchConfig(Table):
     hand file."""
     layout: LayoutConfig = LayoutConfig()
     code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
-    """Width of a resistance code on the bus, bits."""
+    """Width of a resistance code on the bus, in bits."""
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
@@ -203,7 +203,7 @@ class PatchConfig(Table):
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
-    """File with the resistances at rest, ohm: one line per upper wire, one number per lower wire.
+    """File with the resistances at rest in ohms: one line per upper wire, one number per lower wire.
     If None, the host reads the resistances at rest from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
     tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (

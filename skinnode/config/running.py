@@ -33,10 +33,10 @@ class SolverConfig(Table):
     estimate_noise: bool = False
     """Estimate the noise in the resistances from the stream of scans. Requires the method ``posterior``."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
-    """Estimate drift of the resistances together with the displacement: as one gain for the whole ``patch``,
-    or one gain for each upper ``wire``. Requires the method ``posterior``."""
+    """Estimate the drift of the resistances together with the displacement: as one gain for the whole
+    ``patch``, or one gain for each upper ``wire``. Requires the method ``posterior``."""
     normal_only: bool = False
-    """Solve only for the displacement of the electrodes in z, not for shear."""
+    """Solve only for the z displacement of the electrodes, not for shear."""
     max_std_m: Annotated[
         float | None,
         Field(gt=0, le=1, allow_inf_nan=False),
@@ -53,14 +53,13 @@ class SolverConfig(Table):
     limit is derived from the layout and the properties of the rubber, and applies only to calibrated
     forces."""
     detect: bool = True
-    """Detect touch before solving: reports ``touched``, and does not solve the scans of an untouched
-    patch."""
+    """Detect touch before solving: report ``touched``, and do not solve the scans of an untouched patch."""
     false_alarms_per_hour: Annotated[
         float,
         Field(ge=1e-6, le=1e4, allow_inf_nan=False),
         Allowed("a number from 1e-6 to 1e4 (1/h)"),
     ] = 0.1
-    """Accepted number of touches of each patch that noise alone reports in an hour."""
+    """Accepted number of false touches caused by noise alone, per patch and hour."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel. If None, the host uses one thread per core, but at
     most one per patch."""

@@ -17,17 +17,17 @@ _Cycle = Annotated[
 
 
 class SimulationConfig(Table):
-    """Scene that ``vcan-sim`` simulates on each patch: an indenter repeatedly presses, slides and lifts off.
+    """Scene that ``vcan-sim`` simulates on each patch: an indenter presses, slides and lifts off repeatedly.
 
     The host ignores this table.
     """
 
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
-    """Seed of the random converter noise and indenter positions."""
+    """Random seed for the converter noise and the indenter positions."""
     indenter_radius_m: Length = 0.04
     """Radius of the spherical indenter, metres."""
     depth: Ratio = 0.1
-    """Maximum indentation, as a fraction of the height of the upper electrodes. With 0, nothing touches the
+    """Maximum indentation, as a fraction of the height of the upper electrodes. If 0, nothing touches the
     hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3
@@ -36,6 +36,6 @@ class SimulationConfig(Table):
     slide_speed_m_per_s: _Speed = 0.008
     """Sliding speed of the indenter, metres per second."""
     cycle_s: _Cycle = 4.0
-    """Duration of one cycle of press, slide and lift, seconds."""
+    """Duration of one cycle (pressing, sliding and lifting off), seconds."""
     converter_noise: Ratio = 3e-6
     """Standard deviation of the simulated converter's noise, relative to the resistance."""

@@ -34,7 +34,7 @@ def one_of(names: Any) -> Allowed:
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """Resolve a path that is relative to the folder of the hand file, and check that the file exists.
+    """Resolve a path relative to the folder of the hand file, and check that the file exists.
 
     Raises:
         ValueError: The file does not exist.

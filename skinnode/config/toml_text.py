@@ -1,7 +1,7 @@
 """Reads TOML files, and finds the line and column of each key.
 
 tomllib parses a file and checks its syntax, but does not record positions. A scanner therefore reads each
-file that tomllib has accepted once more, to find the positions of the keys. No maintained TOML parser that
+file again after tomllib has accepted it, to find the positions of the keys. No maintained TOML parser that
 records positions is as strict as tomllib.
 """
 
@@ -18,7 +18,7 @@ from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.files.input_file import read_input
 
 KeyPath = tuple[int | str, ...]
-"""Path of a key: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
+"""Path of a key: ``patches[1].node_id`` is represented as ``("patches", 1, "node_id")``."""
 
 _GAP: Final = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 _SPACE: Final = re.compile(r"[ \t]*")
@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts of a key path. Keys in a hand file have at most six parts."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern for a key with at least 4 × ``_DEEPEST`` parts. It also matches other text that consists of so many
-words joined by dots, which does not occur in hand files."""
+"""Pattern for a key with at least 4 × ``_DEEPEST`` parts. It also matches other text with that many words
+joined by dots, which does not occur in hand files."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -53,7 +53,7 @@ class Document:
     """Line and column of each key, array item and table, counted from 1."""
 
     def where(self, key: KeyPath) -> str:
-        """Return ``file:line:column`` of a key; if the key is missing, that of the enclosing table."""
+        """Return ``file:line:column`` of a key or, if the key is missing, of the enclosing table."""
         for length in range(len(key), 0, -1):
             if key[:length] in self.places:
                 line, column = self.places[key[:length]]
@@ -86,7 +86,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise _syntax_error(str(path), text, str(error)) from None
     except RecursionError:
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path)) from None
-    except ValueError:  # an integer with more digits than Python converts
+    except ValueError:  # an integer with more digits than Python can convert
         raise ConfigError(what, _TOO_LONG, _INTEGERS, where=str(path)) from None
     leaves = list(_leaves(table))
     if any(len(key) > _DEEPEST for key, _ in leaves):
@@ -99,7 +99,7 @@ def read_toml(path: Path, what: str) -> Document:
 
 
 def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield path and value of all scalars, of empty tables and arrays, and of values nested too deeply."""
+    """Yield the path and value of each scalar, empty table or array, and value that is nested too deeply."""
     todo: list[tuple[KeyPath, Any]] = [((), table)]
     while todo:
         key, value = todo.pop()
@@ -115,7 +115,7 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
-    """Convert an error message of tomllib to a ConfigError.
+    """Convert an error message from tomllib to a ConfigError.
 
     The message ends with the position: ``(at line 3, column 5)`` or ``(at end of document)``.
     """

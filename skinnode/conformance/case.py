@@ -46,7 +46,7 @@ class Case:
     """Area and number of the case, such as ``SDO-07``."""
     title: str
     clause: str
-    """Clause of CiA 301 v4.2.0 that the case checks, or of another document if one is named."""
+    """Clause that the case checks, of CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property
@@ -64,13 +64,13 @@ class Result:
     why: str = ""
     """Reason for the verdict; empty if the device passed.
 
-    For a failure, this is what was expected and what was received.
+    For a failure, the text says what was expected and what was received.
     """
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
-    """Newest frames sent and received during the case."""
+    """Most recent frames sent and received during the case."""
 
 
 def case(id: str, title: str, clause: str) -> Callable[[Callable[[Dut], None]], Case]:
-    """Return a decorator that turns a function into a case."""
+    """Return a decorator that turns a function into a conformance case."""
     return lambda run: Case(id, title, clause, run)

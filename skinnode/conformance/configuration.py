@@ -16,13 +16,13 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Objects that are written after all others, and their order. The SYNC counter overflow value can be written
+"""Objects that are written after all others, in this order. The SYNC counter overflow value can be written
 only while the SYNC period (0x1006) is 0. Writing 0x1005 may start the SYNC producer. 0x1020 comes last,
 because writing any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all rw objects of fixed length, except 0x1003, 0x1010 and 0x1011."""
+    """Read all fixed-length rw objects, except 0x1003, 0x1010 and 0x1011."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -30,7 +30,7 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # the cases of area OD report this
+            continue  # reported by the OD cases
     return values
 
 

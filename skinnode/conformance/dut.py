@@ -44,7 +44,7 @@ class Dut:
 
     @property
     def error_control_id(self) -> int:
-        """COB-ID of boot-up, heartbeat and node guarding."""
+        """COB-ID of boot-up messages, heartbeats and node guarding."""
         return 0x700 + self.node_id
 
     @property
@@ -59,7 +59,7 @@ class Dut:
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset the node and wait for its boot-up message. Raises Failed if it does not arrive."""
+        """Reset the node and wait for its boot-up message. Raises Failed if the message does not arrive."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(
@@ -119,7 +119,7 @@ class Dut:
             self.need(GUARD_TIME)
 
     def state(self, what: str) -> int:
-        """Return the NMT state from a heartbeat, or by node guarding if the node has no heartbeat.
+        """Return the NMT state from a heartbeat or, if the node has no heartbeat, from a guarding response.
 
         Call :meth:`start_heartbeat` first. The state is taken from the second heartbeat received, because the
         first may have been sent before the call.

@@ -25,7 +25,7 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Size of each data type of fixed length, bytes (CiA 301 v4.2.0, table 44)."""
+"""Size in bytes of each fixed-length data type (CiA 301 v4.2.0, table 44)."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -44,7 +44,7 @@ _VAR, _ARRAY, _RECORD, _DOMAIN = 0x7, 0x8, 0x9, 0x2
 
 @dataclass(frozen=True, slots=True)
 class EdsEntry:
-    """EDS entry of one value, identified by index and sub-index."""
+    """EDS entry for one value, identified by index and sub-index."""
 
     index: int
     subindex: int
@@ -64,7 +64,7 @@ class EdsEntry:
 
     @property
     def size(self) -> int:
-        """Size of the value, bytes; 0 for a type of variable length."""
+        """Size of the value in bytes; 0 for a variable-length type."""
         return SIZES.get(self.data_type, 0)
 
     @property
@@ -130,7 +130,7 @@ class Eds:
     source: str
     """File name or other origin of the EDS, for messages."""
     device: Mapping[str, str]
-    """Options of section DeviceInfo, with keys in lower case."""
+    """Options in the DeviceInfo section, with keys in lower case."""
     dummies: frozenset[int]
     """Data types that may be mapped as dummy entries (section DummyUsage)."""
     entries: Mapping[tuple[int, int], EdsEntry]
@@ -150,7 +150,7 @@ class Eds:
         return (entry for key, entry in self.entries.items() if first <= key[0] <= last)
 
     def indices(self, first: int, last: int) -> list[int]:
-        """Return the indices from ``first`` to ``last`` that have an object."""
+        """Return the indices of all objects from ``first`` to ``last``."""
         return sorted({index for index, _ in self.entries if first <= index <= last})
 
 
@@ -171,7 +171,7 @@ def number(text: str, node_id: int = 0) -> int:
 
 
 def _hex(text: str) -> bytes | None:
-    """Parse hexadecimal text, the CiA 306 notation of an OCTET_STRING; None if it is not hexadecimal."""
+    """Parse hexadecimal text, the CiA 306 notation for an OCTET_STRING; None if the text is malformed."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -186,7 +186,7 @@ def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
         key: Option or key that specifies the file, for messages.
 
     Returns:
-        The EDS, whose ``source`` names a non-ASCII encoding, and the text of the file.
+        The EDS and the text of the file. If the encoding is not ASCII, the ``source`` of the EDS names it.
 
     Raises:
         ConfigError: The file cannot be read.
@@ -233,7 +233,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
     try:
         found += _listed(sections, {index for index, _ in entries})
         dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
-    except ValueError as error:  # an option that must be a number is not
+    except ValueError as error:  # an option that must be a number is not one
         allowed = "numbers in CiA 306 format in the lists of objects and dummy entries"
         raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
@@ -263,7 +263,7 @@ def _entries(
                 _object(entries, index, sections[title], found)
         except (ValueError, KeyError) as error:
             found.append(f"[{title}]: {error}")
-        if len(entries) > _MOST_ENTRIES:  # with CompactSubObj, 60 characters declare 255 entries
+        if len(entries) > _MOST_ENTRIES:  # with CompactSubObj, 60 characters can declare 255 entries
             got = Shown(f"more than {_MOST_ENTRIES} values in the sections up to {title}")
             raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
     return entries, found
@@ -287,7 +287,7 @@ def _object(
     if compact > 254:
         found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
         compact = 0
-    if compact:  # CompactSubObj declares identical sub-objects without a section of their own
+    if compact:  # CompactSubObj declares identical sub-objects that have no sections of their own
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
         for subindex in range(1, compact + 1):

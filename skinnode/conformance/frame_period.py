@@ -16,7 +16,7 @@ from skinnode.transport import Frame
 
 
 def gaps_ms(frames: Sequence[Frame]) -> list[float]:
-    """Return the intervals between successive frames, ms."""
+    """Return the intervals between successive frames, in ms."""
     return [(after.t_ns - before.t_ns) * 1e-6 for before, after in itertools.pairwise(frames)]
 
 

@@ -1,4 +1,4 @@
-"""Helpers for cases about PDOs: list, configure, trigger and receive the PDOs of the device under test."""
+"""Helpers for PDO cases: list, configure, trigger and receive the PDOs of the device under test."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Pdo:
 
 
 class Unsupported(Exception):
-    """Raised if a PDO does not support an optional sub-index, transmission type or remote frames."""
+    """Raised if a PDO does not support an optional sub-index, a transmission type or remote frames."""
 
 
 def rpdos(dut: Dut) -> list[Pdo]:
@@ -79,7 +79,7 @@ def mapped(dut: Dut, pdo: Pdo) -> list[int]:
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Return the length of a PDO with these mapping entries, bytes."""
+    """Return the length of a PDO with these mapping entries, in bytes."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 
@@ -175,7 +175,7 @@ def each_tpdo(dut: Dut, trial: Trial) -> None:
 
 
 def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
-    """Wait for the next frame of a PDO. Raises Failed if none arrives, or if it has another length."""
+    """Wait for the next frame of a PDO. Raises Failed if no frame arrives, or if its length is wrong."""
     frame = dut.bus.expect(can_id, what)
     if len(frame.data) != length:
         raise Failed(f"{counted(length, 'byte')} as mapped, {what}", describe(frame))
@@ -183,7 +183,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Discard frames with ``can_id`` until none arrives for 20 ms, but for half a second at most."""
+    """Discard frames with ``can_id`` until none arrives for 20 ms, but for at most half a second."""
     end_s = time.monotonic() + 0.5
     while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

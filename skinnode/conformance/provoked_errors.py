@@ -1,4 +1,4 @@
-"""Provokes errors of the device by short RPDOs, missing heartbeats and missing guarding requests."""
+"""Provokes device errors with short RPDOs, missing heartbeats and missing guarding requests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CONSUMER: Final = 0x1016
 
 
 def emcy_code(frame: Frame) -> int:
-    """Return the error code of an emergency message. Raises Failed if it does not have 8 bytes."""
+    """Return the error code of an emergency message. Raises Failed if the message is not 8 bytes long."""
     if len(frame.data) != 8:
         raise Failed("an emergency message of 8 bytes", describe(frame))
     return int.from_bytes(frame.data[:2], "little")
@@ -60,7 +60,7 @@ def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
 
 
 def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int = 5) -> int:
-    """Send heartbeats of another node; return the time of the last one (monotonic clock, ns)."""
+    """Send heartbeats as another node; return the time of the last heartbeat (monotonic clock, ns)."""
     sent_ns = 0
     for number in range(times):
         if number:
@@ -75,7 +75,7 @@ def lose_partner(dut: Dut, within_ms: int = 100) -> None:
     Guarding requests are used only if the device has no heartbeat consumer.
 
     Raises:
-        NotApplicable: The device has neither heartbeat consumer nor life guarding.
+        NotApplicable: The device has neither a heartbeat consumer nor life guarding.
     """
     if dut.eds.find(CONSUMER, 1) is not None:
         partner = foreign_id(dut)

@@ -20,12 +20,12 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of successive cases without any response to a reset, after which no further cases are run."""
+"""Number of consecutive cases without a response to the reset after which no further cases are run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of a conformance run; ``problems`` lists errors while restoring the node's configuration."""
+    """Results of a conformance run; ``problems`` lists failures to restore the node's configuration."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]

@@ -53,7 +53,7 @@ MEANINGS: Final = {
 """Meanings of the SDO abort codes (CiA 301 v4.2.0, table 22)."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # upload limit, in case the device never sends the last segment
+_MOST_BYTES: Final = 1 << 20  # limits uploads in case the device never sends the last segment
 _BLOCK_SIZE: Final = 20
 
 
@@ -81,12 +81,12 @@ def crc16(data: bytes) -> int:
 
 
 def mux(index: int, subindex: int) -> bytes:
-    """Return the multiplexer of an SDO message: index and sub-index, three bytes."""
+    """Return the multiplexer of an SDO message: index and sub-index as three bytes."""
     return struct.pack("<HB", index, subindex)
 
 
 class SdoClient:
-    """Client of the default SDO of ``node_id``."""
+    """SDO client that uses the default SDO of node ``node_id``."""
 
     def __init__(self, bus: Tester, node_id: int) -> None:
         self._bus = bus
@@ -99,17 +99,17 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next response. Raises Failed if none arrives, or if it does not have eight bytes."""
+        """Return the next response. Raises Failed if none arrives, or if it is not eight bytes long."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
-        """Discard pending responses, send a request, and return its response, which may be an abort."""
+        """Discard pending responses, send a request, and return the response, which may be an abort."""
         self._bus.pending(self.answer_id)
         self.send(request)
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """Send a request and return its response, like :meth:`ask`. Raises Aborted if it is an abort."""
+        """Send a request and return the response, like :meth:`ask`. Raises Aborted if the device aborts."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
@@ -151,7 +151,7 @@ class SdoClient:
     # --- upload
 
     def read(self, index: int, subindex: int = 0) -> bytes:
-        """Upload a value by expedited or segmented transfer, as the device chooses."""
+        """Upload a value by expedited or segmented transfer, depending on the device's response."""
         what = f"read of 0x{index:04X}:{subindex:02X}"
         answer = self.served(b"\x40" + mux(index, subindex), what)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != mux(index, subindex):
@@ -183,9 +183,9 @@ class SdoClient:
     def read_block(
         self, index: int, subindex: int = 0, *, crc: bool = False, size: int = _BLOCK_SIZE
     ) -> bytes:
-        """Upload a value by block transfer, and check sequence numbers, length and CRC.
+        """Upload a value by block transfer, and check the sequence numbers, length and CRC.
 
-        The length is checked if the device announces it, the CRC if both sides support it.
+        The length is checked if the device announces it; the CRC is checked if both sides support it.
 
         Args:
             index: Index.
@@ -220,7 +220,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Return the data of a sub-block, its number of segments, and whether it is the last sub-block."""
+        """Return the data and the segment count of a sub-block, and True if it is the last sub-block."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -247,7 +247,7 @@ class SdoClient:
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:
-        """Download a value by segmented transfer, whatever its length."""
+        """Download a value by segmented transfer, regardless of its length."""
         what = f"segmented write to 0x{index:04X}:{subindex:02X}"
         start = b"\x21" + mux(index, subindex) + struct.pack("<I", len(data))
         _check(self.served(start, what), b"\x60" + mux(index, subindex) + bytes(4), what)

@@ -16,11 +16,12 @@ from skinnode.transport import CanPort, Frame
 ANSWER_S: Final = 1.0
 """Maximum wait for a response, s.
 
-Devices respond much faster. The limit is generous, so that a delay on the tester's machine is not a failure.
+Devices respond much faster. The limit is generous, so that a delay on the tester's machine does not cause a
+failure.
 """
 
 QUIET_S: Final = 0.06
-"""Time to wait for a frame that must not be sent, s."""
+"""Time to listen for a frame that must not be sent, s."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
@@ -76,7 +77,7 @@ class Tester:
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """Newest frames sent and received since :meth:`begin`, at most 400."""
+        """Most recent frames sent and received since :meth:`begin`, at most 400."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:

@@ -1,4 +1,4 @@
-"""Simulated hand for ``skinnode demo`` and ``skinnode monitor --simulate``: run, score and display.
+"""Runs, scores and displays a simulated hand for ``skinnode demo`` and ``skinnode monitor --simulate``.
 
 ::
 
@@ -6,5 +6,5 @@
     plot
 
 Apart from some benchmarks, only this package imports both the simulator and the host. The two communicate
-only over the bus. The true displacements of the simulator are used only for scoring.
+only over the bus. The simulator's true displacements are used only for scoring.
 """

@@ -18,12 +18,12 @@ _PLACES: Final = {
     "wrist": ((-18.0, -70.0, -4.0), (-0.25, 0.0, 0.0)),
     "back": ((18.0, -18.0, -28.0), (0.0, 3.1416, 0.0)),
 }
-"""Position (mm) and roll, pitch and yaw (radians) of the named patches on a half-closed left hand.
+"""Positions (mm) and roll, pitch and yaw angles (radians) of the named patches on a half-closed left hand.
 
-The places are invented; the palm faces the z axis, and the fingers point along the y axis.
+The poses are invented; the palm faces along the z axis, and the fingers point along the y axis.
 """
 _MORE_MM: Final = 50.0
-"""Distance between patches that have no name of their own, in rows below the wrist, mm."""
+"""Spacing of the patches without a predefined name, which lie in rows below the wrist, mm."""
 _SYNC_MS_PER_PATCH: Final = 20
 """SYNC period per patch, ms. A scan consists of 101 frames of up to 135 bits, so the bus load is at most 68 %
 at 1 Mbit/s."""
@@ -34,7 +34,7 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
 
     Args:
         patches: Number of patches, 1 to 127.
-        seed: Seed of the simulated touches and of the converter noise.
+        seed: Seed for the simulated touches and the converter noise.
     """
     names = [_NAMES[i] if i < len(_NAMES) else f"patch{i + 1}" for i in range(patches)]
     return parse_hand(
@@ -59,7 +59,7 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
 
 
 def _pose(number: int, name: str) -> dict[str, list[float]]:
-    """Return the pose of a patch in the hand file's form."""
+    """Return the pose of a patch in the format of the hand file."""
     row, column = divmod(number - len(_NAMES), 4)
     more = (_MORE_MM * (column - 2), _MORE_MM * (-2.5 - row), 0.0), (0.0, 0.0, 0.0)
     position_mm, rpy_rad = _PLACES.get(name, more)

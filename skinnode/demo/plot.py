@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchTrace:
-    """Plot data of one patch and T scans; times are in seconds since the start, lengths in metres."""
+    """Plot data for T scans of one patch; times are in seconds since the start, lengths in metres."""
 
     name: str
     rest_m: Float
@@ -25,7 +25,7 @@ class PatchTrace:
     depth_m: Float
     """(T,) true depth of the deepest electrode in each scan."""
     error_m: Float
-    """(T,) RMS error of the field of each scan."""
+    """(T,) RMS error of the field for each scan."""
     reported_m: Float
     """(T,) RMS of the standard deviations reported for each scan."""
     snapshot_truth_m: Float

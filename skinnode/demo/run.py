@@ -47,15 +47,15 @@ class PatchReport:
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Number of scans that were skipped, because a newer scan arrived before a solver was free."""
+    """Number of scans that were skipped because a newer scan arrived before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """Number of PDOs that the node sent and the host did not assemble into scans."""
+    """Number of PDOs that the node sent but the host did not assemble into scans."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
     distrust: str = ""
-    """Why the newest untrusted field was not trusted; empty if all fields were trusted."""
+    """Reason why the newest untrusted field was not trusted; empty if all fields were trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +71,9 @@ class Report:
     """Number of PDOs assembled into scans by the host."""
     frames_lost: int
     bus_load: float
-    """Equivalent bus load: fraction of the duration for which all frames would occupy a 1 Mbit/s bus."""
+    """Equivalent bus load: fraction of the run time for which the frames would occupy a 1 Mbit/s bus."""
     faults: tuple[str, ...]
-    """Faults, each of which causes exit status 1; empty if the run succeeded."""
+    """Faults found, any of which causes exit status 1; empty if the run succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class _Watch:
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
-    """Why the newest untrusted field was not trusted; empty if all fields were trusted."""
+    """Reason why the newest untrusted field was not trusted; empty if all fields were trusted."""
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp
@@ -150,7 +150,7 @@ def _depth_std_m(frame: FieldFrame) -> float:
 
 
 class _Progress:
-    """Displays the progress of a run, as a live view on a terminal or else as one line per second."""
+    """Displays the progress of a run: a live view on a terminal, otherwise one line per second."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -233,7 +233,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Score and display only while no scan is being solved, so as not to delay the host.
+                    # Score and display only while no scan is being solved, to avoid delaying the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
@@ -366,7 +366,7 @@ def print_report(console: Console, report: Report) -> None:
             soft_wrap=True,
         )
     else:
-        console.print("no patch was pressed during this run; use a larger --seconds")
+        console.print("no patch was pressed during this run; increase --seconds")
     for fault in report.faults:
         console.print("fault: ", style="bold red", end="")
         console.print(fault)

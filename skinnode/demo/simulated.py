@@ -1,7 +1,7 @@
 """Runs simulated patches in a separate process, for commands that demonstrate the host.
 
-In the same process, the patches and the host would compete for the interpreter lock, and the performance
-figures of the host would include the simulation.
+In a single process, the patches and the host would compete for the interpreter lock, and the host's
+performance figures would include the simulation.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
     """Return a copy of the hand for simulated patches.
 
     All buses are replaced with virtual buses (UDP multicast), because simulated nodes must never send on a
-    bus with real nodes. Their frames stay on this machine (``hop_limit`` 0). All tolerances are "exact",
-    because simulated patches match their layouts exactly.
+    bus with real nodes. Their frames stay on this machine (``hop_limit`` 0). All tolerances are set to
+    "exact", because simulated patches match their layouts exactly.
     """
     exact = TolerancesConfig.model_validate("exact")
     patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)

@@ -1,4 +1,4 @@
-"""Draws the demo on a terminal: bus load, and height map, health and scan rate of each patch."""
+"""Draws the demo on a terminal: the bus load, and the height map, health and scan rate of each patch."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class HeightMap:
 
 
 def _surface(displacement_m: Float | None) -> Surface:
-    """Return the surface to draw; it is flat if there is no field yet."""
+    """Return the surface to draw, which is flat if there is no field yet."""
     moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
     unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
     return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)

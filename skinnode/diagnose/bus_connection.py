@@ -22,9 +22,9 @@ LONGEST_HEARTBEAT_S: Final = 2.5
 """Maximum wait for a heartbeat, s. Heartbeats with a longer period are missed."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum wait for the response to the first and to the second remote frame, s.
+"""Maximum waits for the responses to the first and the second remote frame, s.
 
-The second remote frame is for a node that was too busy to answer the first.
+The second remote frame is sent in case the node was too busy to answer the first.
 """
 
 _POLL_S: Final = 0.002
@@ -45,7 +45,8 @@ class State(NamedTuple):
 def no_answer(wrong: str) -> str:
     """Describe a node that sent no valid SDO response.
 
-    ``wrong`` is its newest invalid response, in hexadecimal; empty if the node did not respond at all.
+    ``wrong`` is the node's most recent invalid response, in hexadecimal; empty if the node did not respond at
+    all.
     """
     if not wrong:
         return "does not answer SDO requests"
@@ -83,7 +84,7 @@ class BusConnection(Closing):
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """End the SDO transfers of all threads; each transfer raises Abandoned."""
+        """End the SDO transfers in all threads; each transfer raises Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
@@ -119,7 +120,7 @@ class BusConnection(Closing):
         return [data for t_ns, data in answers if t_ns >= since_ns]
 
     def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
-        """Check that a node answers SDO requests; one retry is made.
+        """Check that a node answers SDO requests, with one retry.
 
         Args:
             node_id: The node.
@@ -148,7 +149,7 @@ class BusConnection(Closing):
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Read the heartbeat period of a node (0x1017), s; 0 if disabled, None if it cannot be read."""
+        """Read a node's heartbeat period (0x1017) in seconds; 0 if disabled, None if it cannot be read."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:
@@ -166,7 +167,7 @@ class BusConnection(Closing):
             return False
 
     def state(self, node_id: int, heartbeat_s: float | None, *, guarding: bool, since_ns: int = 0) -> State:
-        """Determine the NMT state of a node from its heartbeat, or by node guarding if there is none.
+        """Determine the NMT state of a node from its heartbeat or, if it sends none, by node guarding.
 
         Args:
             node_id: The node.
@@ -192,7 +193,7 @@ class BusConnection(Closing):
         return State(None, "no heartbeat, no guarding")
 
     def close(self) -> None:
-        """Close the bus and wait for its receiving thread to end."""
+        """Close the bus and wait for its receiving thread to exit."""
         self._mainline.stop()
         self.link.close()
 

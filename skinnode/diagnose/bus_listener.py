@@ -16,7 +16,7 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Number of newest messages kept of each kind and node, such as one minute of heartbeats at 4 Hz."""
+"""Maximum number of messages kept per kind and node; enough for one minute of heartbeats at 4 Hz."""
 
 
 class Beat(NamedTuple):
@@ -46,8 +46,7 @@ class NodeTraffic:
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
     """Reception time (ns) and eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Reception time (ns) and data of the newest frame on the COB-ID of SDO responses, whatever its
-    length."""
+    """Reception time (ns) and data of the newest frame of any length on the COB-ID of SDO responses."""
 
 
 class BusListener:
@@ -65,7 +64,7 @@ class BusListener:
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:
-        """Messages received, by node-ID; a copy."""
+        """Copy of the messages received, by node-ID."""
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
@@ -73,7 +72,7 @@ class BusListener:
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
-        """Return the newest heartbeat, boot-up or guarding message after ``since_ns``, if any."""
+        """Return the newest heartbeat, boot-up or guarding message received after ``since_ns``, if any."""
         beats = self.node(node_id).beats
         newest = beats[-1] if beats else None
         return newest if newest is not None and newest.t_ns > since_ns else None

@@ -32,13 +32,13 @@ from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
-"""Number of scans to capture; with 50 scans, the error of the estimated noise is about 10 %."""
+"""Number of scans to capture; with 50 scans, the error in the estimated noise is about 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum duration of the capture, s, whatever the SYNC period."""
+"""Maximum duration of the capture, s, regardless of the SYNC period."""
 
 DEFAULT_NOISE: Final = 3e-6
-"""Relative noise of the converter, assumed if there is no hand file."""
+"""Relative converter noise assumed if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
 """Pauses before successive attempts to read a node, s. A node's SDO server is busy for 0.1 to 0.3 s while a
@@ -56,12 +56,12 @@ Answer = TypeVar("Answer")
 def collect_facts(
     bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
 ) -> BusFacts:
-    """Collect the facts about one bus. A failure of the bus is recorded in the facts and not raised.
+    """Collect the facts about one bus. A bus failure is recorded in the facts instead of being raised.
 
     Args:
         bus: The bus.
         hand: The hand; None if there is no hand file.
-        active: Whether to start nodes that are not running, and to send SYNC if nobody else does. Nodes
+        active: Whether to start nodes that are not running, and to send SYNC if no other device does. Nodes
             started here return to PRE-OPERATIONAL at the end.
         progress: Called with a description of each step.
     """
@@ -196,7 +196,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
     """Capture scans of the running patches; if ``active`` is set, start the other patches first.
 
     Returns:
-        Whether this program sent SYNC, and the bus load (fraction) in the busiest second.
+        True if this program sent SYNC, and the bus load (fraction) in the busiest second.
     """
     overflows: dict[int, int] = {}
     for node_id, profile in profiles.items():
@@ -233,7 +233,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
-    """Return the minimum SYNC period of a node that has its default inhibit time, s; 0 for any other node.
+    """Return the minimum SYNC period (s) of a node that has its default inhibit time; 0 for any other node.
 
     With a shorter period, the node would not finish a scan before the next SYNC. A host replaces the default
     with an inhibit time that suits the hand's SYNC period.
@@ -274,7 +274,7 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
     """Count the NMT commands that a host of this hand would not send.
 
     A host sends only *start* and *enter pre-operational*, each addressed to a single patch. A second host of
-    the same hand therefore goes unnoticed here; it is detected by its SYNCs.
+    the same hand is therefore not detected here, but by its SYNCs.
     """
     return sum(
         count

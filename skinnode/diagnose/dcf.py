@@ -2,8 +2,8 @@
 
 Numbers and printable ASCII strings are written to ``ParameterValue`` as CiA 306 specifies, and values of type
 OCTET_STRING or DOMAIN are written there in hexadecimal. CiA 306 has no notation for other strings: INI
-readers would change non-ASCII characters, leading or trailing blanks, and comment signs. The bytes of such a
-string are written as a comment, which :func:`expected` reads and other tools skip::
+readers would change non-ASCII characters, leading or trailing blanks, and comment characters. The bytes of
+such a string are written as a comment, which :func:`expected` reads and other tools skip::
 
     ;ParameterBytes=63 61 66 c3 a9
 """
@@ -48,7 +48,7 @@ class Dcf(NamedTuple):
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
     """Return the DCF of a device: its EDS with commissioning data and the values of its writable objects.
 
-    The text is meant for a UTF-8 file, even if the EDS has another encoding.
+    The text is meant for a UTF-8 file, even if the EDS has a different encoding.
 
     Args:
         sheet: EDS of the device.
@@ -117,7 +117,7 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
 
 
 def _is_configuration(reading: Reading) -> bool:
-    """Return whether the object is part of the configuration that a tool downloads from a DCF."""
+    """Return whether the object is part of the configuration that a tool downloads from a DCF to a node."""
     measured = reading.index in (*NOT_CONFIGURATION, od.BASELINE_DOMAIN)
     command = (reading.index, reading.subindex) in od.COMMANDS
     return reading.access in ("rw", "rww", "rwr") and not measured and not command
@@ -126,7 +126,7 @@ def _is_configuration(reading: Reading) -> bool:
 def _standard_form(reading: Reading, data: bytes) -> str | None:
     """Return the value in CiA 306 notation; None if this would change its bytes.
 
-    Integers from 10 on are written in hexadecimal, and reals as their bit patterns, as conforming tools
+    Integers of 10 or more are written in hexadecimal, and reals as their bit patterns, as conforming tools
     expect.
     """
     if reading.data_type in _STRINGS:
@@ -141,7 +141,7 @@ def _standard_form(reading: Reading, data: bytes) -> str | None:
 
 
 def _plain(data: bytes, codec: str) -> str | None:
-    """Decode a string; None if some INI reader would change it."""
+    """Decode a string; None if an INI reader might change it."""
     try:
         text = data.decode(codec)
     except UnicodeDecodeError:

@@ -1,7 +1,7 @@
 """Finds the nodes on a bus by SDO, heartbeat and LSS.
 
 The search requests the device type (0x1000) from every node-ID and records the heartbeats received during the
-search. Nodes without a node-ID are found by LSS, which switches their LSS mode. The search changes nothing
+search. Nodes without a node-ID are found by LSS, which changes their LSS mode. The search changes nothing
 else on any node.
 """
 
@@ -22,16 +22,17 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests of a sweep, s. At 1 Mbit/s, the requests cause a bus load of one sixth."""
+"""Interval between requests in a sweep, s. At 1 Mbit/s, the requests cause a bus load of one sixth."""
 
 ANSWER_S: Final = 0.12
-"""Waiting time for responses after the last request of a sweep, s."""
+"""Time to wait for responses after the last request in a sweep, s."""
 
 SWEEPS: Final = 2
 """Number of sweeps over all node-IDs. The second sweep reaches nodes that were busy during the first."""
 
 LISTEN_S: Final = 1.2
-"""Minimum listening time, s. A stopped node answers no SDO request and is found only by its heartbeats."""
+"""Minimum listening time, s. A stopped node does not answer SDO requests and is found only by its
+heartbeats."""
 
 LSS_S: Final = 1.5
 """Maximum duration of the search for nodes without a node-ID, s. The search then ends, even if further nodes
@@ -106,7 +107,7 @@ class Discovery:
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
-    """Whether further nodes without a node-ID exist that the search did not identify."""
+    """Whether there are more nodes without a node-ID, which the search did not identify."""
     seconds: float
 
 
@@ -133,7 +134,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
             unconfigured, more = lss.result()
-        except BaseException:  # on Ctrl-C, the pool's threads must end, too
+        except BaseException:  # the pool's threads must end on Ctrl-C, too
             connection.abandon()
             raise
     heard = connection.listener.nodes
@@ -143,7 +144,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
 
 def _let_others_finish(connection: BusConnection) -> None:
-    """Wait until the SDO transfers of other clients have ended; a request from here would abort them.
+    """Wait until other clients' SDO transfers have ended; a request from this program would abort them.
 
     A host performs SDO transfers mainly during bring-up.
     """
@@ -164,7 +165,7 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
     """Find the nodes without a node-ID, and return them to LSS waiting mode.
 
     Returns:
-        The LSS addresses found, and whether further nodes exist.
+        The LSS addresses found, and True if there are more such nodes.
     """
     found: list[LssAddress] = []
     end_s = time.monotonic() + LSS_S
@@ -231,7 +232,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
 
 
 def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> FoundNode | None:
-    """Describe a node that gave no valid SDO response; None if it sent no heartbeat either."""
+    """Describe a node that sent no valid SDO response; None if it sent no heartbeat either."""
     beat = connection.listener.newest_beat(node_id)
     if beat is None:
         return None
@@ -255,8 +256,8 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 def _two_serials(connection: BusConnection, node_id: int) -> str:
     """Return evidence that two nodes have this node-ID.
 
-    Empty if a new request gets only one response; the second response during the sweep then belonged to an
-    earlier request.
+    The text is empty if a new request gets only one response; the second response during the sweep then
+    belonged to an earlier request.
     """
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]

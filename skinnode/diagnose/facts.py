@@ -26,7 +26,7 @@ class Sure(StrEnum):
     CERTAIN = "certain"
     """A node or a counter reports the fault directly."""
     LIKELY = "likely"
-    """The evidence has hardly any other explanation."""
+    """There is hardly any other explanation for the evidence."""
     POSSIBLE = "possible"
     """The condition may be intended; only the user can tell."""
 
@@ -36,7 +36,7 @@ class Finding:
     """Fault found by a check."""
 
     area: str
-    """One of bus, nodes, configuration, wires, baseline, timing and losses."""
+    """Area of the check: bus, nodes, configuration, wires, baseline, timing or losses."""
     where: str
     what: str
     sure: Sure
@@ -57,7 +57,7 @@ class ScanFacts:
     t_s: Float
     """(T,) reception time of the last frame of each scan, relative to the first scan, s."""
     latency_s: Float
-    """(T,) time from SYNC to the last frame of the scan, s; NaN if its SYNC was not received."""
+    """(T,) time from SYNC to the last frame of the scan, s; NaN if the SYNC was not received."""
     device_us: Counts
     """(T,) time of the scan on the node's clock, µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
@@ -81,7 +81,7 @@ class ScanFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchFacts:
-    """Configuration and observations of one patch; None stands for an unknown value."""
+    """Configured and observed properties of one patch; None stands for an unknown value."""
 
     name: str
     node_id: int
@@ -92,7 +92,7 @@ class PatchFacts:
     """Inhibit time that the host sets, in units of 100 µs; None if the host does not configure the nodes on
     the bus."""
     eds_problem: str = ""
-    """Difference between the EDS and the patch in the hand file; empty if they match or there is no EDS."""
+    """Difference between the EDS and the patch in the hand file; empty if they match or no EDS is given."""
     found: FoundNode | None = None
     info: NodeInfo | None = None
     failure: str = ""
@@ -112,7 +112,7 @@ class BusFacts:
     channel: str
     bitrate_bps: int
     failure: str = ""
-    """Reason why the bus could not be opened or failed later; empty if it works."""
+    """Reason why the bus could not be opened or later failed; empty if it works."""
     link_state: str | None = None
     """State of the CAN controller reported by the kernel, such as ``ERROR-ACTIVE``."""
     link_bitrate_bps: int | None = None

@@ -131,7 +131,7 @@ def _map(  # noqa: PLR0913 - one image
 def _timeline(scans: ScanFacts) -> str:
     """Plot the delay of each scan after its SYNC (or the scan interval), and mark incomplete scans."""
     figure, (axes,) = _figure(1, 1, height_in=2.6)
-    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # if torn, the last frame may be lost
+    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # a torn scan's end is unknown
     if np.isfinite(late_ms).any():
         axes.plot(scans.t_s, late_ms, ".-", color="#2b6cb0", lw=0.8, label="last frame after SYNC, ms")
         axes.set_ylabel("ms after SYNC")

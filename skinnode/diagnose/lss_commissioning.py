@@ -58,7 +58,7 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Settings of a node to change by LSS."""
+    """Node settings to be changed by LSS."""
 
     node_id: int | None
     """New node-ID; None to keep the current one."""
@@ -116,7 +116,7 @@ def commission(
 
 
 def _configure(connection: BusConnection, wanted: Commissioning) -> str:
-    """Change the settings of the selected node; return the reason if they could not be stored, else ""."""
+    """Change the settings of the selected node; return the reason they were not stored, or ""."""
     if wanted.bitrate_bps is not None:
         connection.lss.set_bit_rate(wanted.bitrate_bps)
     if wanted.node_id is not None:

@@ -92,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """Determine a node's state and settings before the command; a stopped node answers no SDO request."""
+    """Determine a node's state and settings before the command; stopped nodes do not answer SDO requests."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)
@@ -100,7 +100,7 @@ def _watch(connection: BusConnection, node_id: int) -> _Watch:
 
 
 def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
-    """Wait until the node reports the commanded state, or until the time is up."""
+    """Wait until the node reports the commanded state or the time limit expires."""
     wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
     end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:

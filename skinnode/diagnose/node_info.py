@@ -42,7 +42,7 @@ class PatchInfo:
     baseline_missing: int
     """Number of crossings without a baseline."""
     baseline_ohm: tuple[float, float, float] | None
-    """Minimum, median and maximum R0, ohm; None if there is no baseline."""
+    """Minimum, median and maximum R0 in ohms; None if there is no baseline."""
     send_changed_only: bool
     send_threshold_codes: int
     send_refresh_scans: int
@@ -53,7 +53,7 @@ class PatchInfo:
     shorted_upper: tuple[int, ...]
     open_lower: tuple[int, ...]
     shorted_lower: tuple[int, ...]
-    """Numbers of the open and the shorted wires, counted from 0."""
+    """Indices of the open and shorted wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
     """Number of received frames that the node rejected, by reason; counts of 0 are omitted."""
@@ -273,7 +273,7 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the (U, K) baseline R0, ohm; 0 for a crossing without a baseline.
+    """Read the (U, K) baseline R0 in ohms; 0 for a crossing without a baseline.
 
     Raises NodeError if the transfer fails or the data have the wrong size.
     """

@@ -1,14 +1,14 @@
-"""Estimates the noise of each crossing and of each wire, even while the skin is touched.
+"""Estimates the noise of each crossing and of each wire, even while the skin is being touched.
 
-The noise of a crossing is the smaller of two estimates. A touch can only increase them. The first estimate
-uses the second differences of successive scans, whose variance is 6 σ²; it is insensitive to slow touches.
-The second estimate is the part of a crossing's signal that the signals of other wires do not explain; it is
-insensitive to quick touches. It relies on the fact that a touch changes all crossings by linear combinations
-of a few functions of time, whereas noise is independent at each crossing.
+The noise of a crossing is the smaller of two estimates. A touch can only increase these estimates. The first
+estimate uses the second differences of successive scans, whose variance is 6 σ²; it is insensitive to slow
+touches. The second estimate is the part of a crossing's signal that the signals of other wires do not
+explain; it is insensitive to quick touches. It relies on the fact that a touch changes all crossings by
+linear combinations of a few functions of time, whereas noise is independent at each crossing.
 
 A touch that is quick, deep and small increases both estimates, but hardly affects the smallest singular
-values of a wire's signals. These determine the noise of wires and of the whole patch while the skin is
-touched.
+values of a wire's signals. These values determine the noise of the wires and of the whole patch while the
+skin is being touched.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans for a noise analysis. With fewer scans, the error of the estimated standard
+"""Minimum number of scans for a noise analysis. With fewer scans, the error in the estimated standard
 deviation exceeds 25 %."""
 
 _MOST_SCANS: Final = 64
-"""Number of scans analysed, counted back from the newest. The computing time grows with its square."""
+"""Maximum number of most recent scans to analyse. The computing time grows with the square of this number."""
 
 _FLOOR: Final = 8
 """Number of singular values in the noise floor of a patch. They determine the noise to within 20 %."""
 
 _MOVED: Final = 6.0
-"""Minimum standard deviation of the signal of a touched crossing, relative to the stated noise."""
+"""Minimum standard deviation of a touched crossing's signal, relative to the stated noise."""
 _EXPLAINED: Final = 2.0
-"""Minimum standard deviation of the signal of a touched crossing, relative to the part that other wires do
-not explain. Pure noise with 25 degrees of freedom exceeds this ratio with a probability of 1e-6."""
+"""Minimum standard deviation of a touched crossing's signal, relative to the part that other wires do not
+explain. Pure noise with 25 degrees of freedom exceeds this ratio with a probability of 1e-6."""
 _TOUCHED: Final = 2
 """Minimum number of crossings affected by a touch. A loose contact affects a single crossing."""
 _STEP: Final = 20.0
@@ -48,8 +48,8 @@ height."""
 _STILL: Final = 0.1
 """Maximum standard deviation of a signal after its jump has been removed, as a fraction of the height."""
 _EVEN: Final = 0.2
-"""Ratio of the individual noise of the crossings to their common noise, below which the common noise is
-attributed to the supply."""
+"""Ratio of the crossings' individual noise to their common noise below which the common noise is attributed
+to the supply."""
 
 Mask = NDArray[np.bool_]
 
@@ -61,17 +61,17 @@ class NoiseAnalysis:
     noise: Float
     """Measured noise relative to R0; NaN if unknown. It is too large if a touch affects both estimates."""
     stated: Float
-    """Expected noise relative to R0: noise of the converter and quantization noise."""
+    """Expected noise relative to R0: converter noise and quantisation noise."""
     level: Float
     """Median R/R0."""
     touched: Mask
-    """Mask of the crossings whose value varied together with those of other crossings."""
+    """Mask of the crossings whose values varied together with those of other crossings."""
     steps: Mask
     """Mask of the crossings that were constant except for a single jump."""
     step_at: Counts
     step_by: Float
     upper: Float
-    """(U,) noise of each upper wire relative to the stated noise, with little influence of a touch; 0 if
+    """(U,) noise of each upper wire relative to the stated noise, hardly affected by a touch; 0 if
     unknown."""
     lower: Float
     """(K,) noise of each lower wire, in the same form as ``upper``."""
@@ -87,7 +87,7 @@ class NoiseAnalysis:
         return int(self.touched.sum()) >= _TOUCHED
 
 
-@functools.lru_cache(maxsize=16)  # three checks and the report ask for the same patches
+@functools.lru_cache(maxsize=16)  # three checks and the report analyse the same patches
 def analyse_noise(scans: ScanFacts) -> NoiseAnalysis:
     """Analyse the noise of a patch; ``scans`` must contain at least :data:`LEAST_SCANS` scans."""
     ratio = scans.ratio[scans.complete] if scans.complete.sum() >= LEAST_SCANS else scans.ratio
@@ -175,7 +175,7 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return the scan and the height of each crossing's largest jump, and a mask of the lasting jumps.
+    """Return the scan and height of each crossing's largest jump, and a mask of the lasting jumps.
 
     A jump is lasting if the medians before and after it differ by its height, and if the signal is otherwise
     nearly constant.

@@ -40,8 +40,8 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""Indices of objects that contain state or trigger an action. They are not configuration, even if the EDS
-specifies a default."""
+"""Indices of objects that contain state or trigger an action. They are not part of the configuration, even if
+the EDS specifies a default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
@@ -98,12 +98,12 @@ class Difference:
     subindex: int
     name: str
     node: str
-    """Value on the node, or the reason why it could not be read."""
+    """Value on the node, or the reason it could not be read."""
     file: str
 
 
 def parse_address(text: str) -> tuple[int, int | None]:
-    """Return index and sub-index of an address such as ``1018:4`` or ``0x1018``.
+    """Return the index and sub-index of an address such as ``1018:4`` or ``0x1018``.
 
     The index is hexadecimal. The sub-index is decimal, or hexadecimal with the prefix ``0x``; it is None if
     the address has none.
@@ -170,7 +170,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """Read one value. An SDO abort is part of the result; NodeError is raised if the node does not answer."""
+    """Read one value. The result reports an SDO abort; NodeError is raised if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -200,7 +200,8 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
     """Return the entries at an address.
 
     Args:
-        eds: EDS of the node; an object that it does not list is described as in CiA 301, if possible.
+        eds: EDS of the node. For objects not listed there, the description in CiA 301 is used if there is
+            one.
         index: Index.
         subindex: Sub-index; None for all sub-indices of the object.
         count: Callback that reads the number of entries from sub-index 0.
@@ -292,8 +293,8 @@ def compare(
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
     """Return whether the value on the node equals the value in the file.
 
-    Trailing NULs of a string are ignored, because the default of an EDS cannot express them. They count if
-    the file gives the value byte by byte.
+    Trailing NULs of a string are ignored, because the default of an EDS cannot express them. They are
+    significant if the file gives the value byte by byte.
     """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
     return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)
@@ -302,7 +303,7 @@ def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
     """Format two different values for display.
 
-    If both would be displayed alike, the bytes from the first difference onwards are appended.
+    If both values would look the same, the bytes from the first difference onwards are appended.
     """
     if got.data is None or expected.data is None or got.text != expected.text:
         return got.text, expected.text

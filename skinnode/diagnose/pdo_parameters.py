@@ -95,7 +95,7 @@ def _optional(remote: RemoteOd, index: int, subindex: int, kind: str) -> int | N
 
 
 def kind_text(pdo: Pdo) -> str:
-    """Return in words when a TPDO is sent, or when the data of an RPDO take effect."""
+    """Describe in words when a TPDO is sent, or when the data of an RPDO take effect."""
     if 1 <= pdo.kind <= 240:
         every = "every SYNC" if pdo.kind == 1 else f"every {pdo.kind} SYNCs"
         return every if pdo.direction == "TPDO" or pdo.kind == 1 else "at the next SYNC"
@@ -123,7 +123,7 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
 
 
 def _shortened(names: list[str]) -> str:
-    """Join names, merging successive names that differ only in their number."""
+    """Join names, merging consecutive names that differ only in their number."""
     shown: list[str] = []
     for name in names:
         stem, _, number = name.rpartition(" ")

@@ -1,8 +1,8 @@
 """Groups findings by root cause.
 
 For example, an overloaded bus causes torn scans, missing scans and emergency messages at every patch on it.
-All these findings are true, but only the overload needs to be corrected. A rule therefore names a cause and
-the findings that it can explain, either at the same patch or, for a cause that concerns the whole bus, at all
+All these findings are correct, but only the overload needs to be fixed. A rule therefore names a cause and
+the findings that it can explain, either at the same patch or, for a cause that affects the whole bus, at all
 of its patches. Where the text of a finding is not specific enough, the rule also tests the evidence: an
 overload explains emergency messages only if all of them report an overrun.
 """
@@ -57,7 +57,7 @@ _CONFIGURED_BY_OTHERS: Final = (
     "the patch scans on its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
-"""Pattern for evidence that reports an error without saying what caused it."""
+"""Pattern for evidence that reports an error without giving its cause."""
 _OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_UNEXPLAINED}")
 _WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_UNEXPLAINED}")
 _RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_UNEXPLAINED}")

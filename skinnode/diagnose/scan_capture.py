@@ -1,4 +1,4 @@
-"""Assembles the scans of patches as the host does, and records SYNCs. Nothing is solved."""
+"""Assembles the patches' scans in the same way as the host, and records SYNCs. Nothing is solved."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ScanCapture:
 
         Args:
             node_id: The node.
-            profile: Numbers of wires and other sizes of the patch.
+            profile: Number of wires and other dimensions of the patch.
             overflow: Overflow value of the SYNC counter; 0 if SYNC has no counter.
             period_s: SYNC period, s.
         """
@@ -114,9 +114,9 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of the SYNC that started a scan, ns; None if it was not received.
+        """Return the time of the SYNC that started a scan, in ns; None if the SYNC was not received.
 
-        This is the last SYNC before the first frame of the scan that has the scan's counter or no counter.
+        This is the last SYNC, with the scan's counter or no counter, before the first frame of the scan.
         """
         for t_ns, number in reversed(list(self.syncs)):  # copied, because another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:

@@ -23,7 +23,7 @@ class _Object(NamedTuple):
     access: str
     array: bool = False
     subs: tuple[tuple[str, int], ...] = ()
-    """Name and data type of the sub-indices of a record, from sub-index 1."""
+    """Name and data type of each sub-index of a record, starting at sub-index 1."""
 
 
 _SDO: Final = (
@@ -86,9 +86,10 @@ _MANY: Final = (
     (range(0x1A00, 0x1C00), _Object("TPDO mapping parameter", _U32, "rw", array=True)),
 )
 SINGLE: Final = tuple(_ONE)
-"""Indices of the objects that a device has at most once."""
+"""Indices of the objects that a device has only once, if at all."""
 SERIES: Final = tuple(indices for indices, _ in _MANY)
-"""Index ranges of the objects that a device may have several times. A device uses the first indices."""
+"""Index ranges of the objects that a device may have several times. A device uses the lowest indices of a
+range."""
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:

@@ -30,8 +30,8 @@ QUIET_S: Final = 0.3
 """Time without SDO frames after which an SDO channel is considered idle, s."""
 
 HOST_BEGINS_S: Final = 1.0
-"""Maximum time from the tare to the first SDO request of a running host, s, in addition to one SYNC period. A
-host on an idle machine needs 0.3 s."""
+"""Maximum time in seconds, in addition to one SYNC period, from the tare to a running host's first SDO
+request. A host on an idle machine needs 0.3 s."""
 
 OTHERS_S: Final = 4.0
 """Maximum wait for the SDO transfers of other clients to end, s."""
@@ -49,13 +49,13 @@ class Tared:
     node_id: int
     bus: str
     problem: str
-    """Why the patch was not tared; empty if it was tared."""
+    """Reason why the patch was not tared; empty if it was tared."""
     crossings: int = 0
     """Number of crossings with a new R0."""
     median_ohm: float | None = None
-    """Median of the new R0, ohm."""
+    """Median of the new R0 values, in ohms."""
     median_change: float | None = None
-    """Median of (new R0 / old R0) − 1; None if there was no old R0."""
+    """Median of (new R0 / old R0) − 1; None if there were no old R0 values."""
 
     @property
     def done(self) -> bool:
@@ -64,7 +64,7 @@ class Tared:
 
 
 def refusal(patch: PatchConfig, bus: BusConfig) -> str:
-    """Return the reason why the hand file rules out taring this patch; empty if there is none."""
+    """Return the reason why the hand file rules out taring this patch; empty if it does not."""
     if patch.baseline is not None:
         return f"a host would overwrite the new baseline with {patch.baseline}"
     if bus.role == "guest" and bus.guest_sends == "nothing":
@@ -90,7 +90,7 @@ def tare(
         progress: Called with a description of each step.
 
     Returns:
-        The result, which also reports a node that does not answer or refuses.
+        The result, including the case that the node does not answer or refuses to tare.
 
     Raises:
         BusError: The bus failed.
@@ -137,14 +137,14 @@ def _tare(
 
 
 def _runs(connection: BusConnection, node_id: int) -> bool:
-    """Return whether the node has been started: it sends chunks, or its heartbeat reports OPERATIONAL."""
+    """Return whether the node is running: it sends chunks, or its heartbeat reports OPERATIONAL."""
     beat = connection.listener.newest_beat(node_id)
     operational = beat is not None and beat.state == NmtState.OPERATIONAL
     return operational or connection.listener.cob_ids[od.chunk_cob_id(node_id)] > 0
 
 
 def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the (U, K) baseline R0, ohm. An upload that another client interrupts is repeated.
+    """Read the (U, K) baseline R0 in ohms. An upload interrupted by another client is repeated.
 
     Raises NodeError if all attempts fail, or if the data have the wrong size.
     """
@@ -166,7 +166,7 @@ def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile
 def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
     """Wait until the node's SDO channel has been idle for QUIET_S, but no longer than OTHERS_S.
 
-    Unless another client begins a transfer, the wait takes at least ``at_least_s``.
+    Unless another client starts a transfer, the wait lasts at least ``at_least_s``.
     """
     begun_s = quiet_s = time.monotonic()
     request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)

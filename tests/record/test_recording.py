@@ -320,7 +320,8 @@ def test_scans_that_were_skipped_are_noted_as_a_replay_counts_them(
     solved = len(list(run))
     skipped = run.patch_stats()["thumb"].skipped
     assert skipped > solved
-    (note,) = [line for line in done.stdout.splitlines() if "skipped for newer" in line]
-    found = re.fullmatch(r"note: thumb: (\d+) scans skipped for newer ones; their frames were recorded", note)
+    (note,) = [line for line in done.stdout.splitlines() if "skipped in favour of newer" in line]
+    expected = r"note: thumb: (\d+) scans skipped in favour of newer scans; their frames were recorded"
+    found = re.fullmatch(expected, note)
     assert found is not None
     assert abs(int(found[1]) - skipped) <= 1  # a scan may be skipped while the host closes

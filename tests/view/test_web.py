@@ -171,7 +171,7 @@ def shown(sdk: None) -> Iterator[tuple[subprocess.Popen[str], int]]:
     command = [sys.executable, "-c", code, "view", "--simulate", "--web", "--port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    assert process.stdout.readline() == f"open http://127.0.0.1:{port}/ in a browser; Ctrl-C ends\n"
+    assert process.stdout.readline() == f"open http://127.0.0.1:{port}/ in a browser; press Ctrl-C to stop\n"
     yield process, port
     process.kill()
     process.communicate()

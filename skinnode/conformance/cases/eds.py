@@ -93,7 +93,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
-    """Yield one line for each property of an entry that is permitted but that some tools cannot handle."""
+    """Yield one line for each property of an entry that is permitted but not supported by some tools."""
     if entry.mappable and not entry.size and entry.data_type in _TEXTS and entry.data_type != _DOMAIN:
         yield f"{entry}: mappable, but of variable length"
     if entry.low is not None and entry.high is not None and entry.low > entry.high:
@@ -109,7 +109,7 @@ def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _default(entry: EdsEntry, node_id: int) -> int | None:
-    """Return the default value of an integer entry; None if it has none or is not an integer.
+    """Return the default value of an integer entry; None if the entry has no default or is not an integer.
 
     Raises ValueError if the default is malformed.
     """

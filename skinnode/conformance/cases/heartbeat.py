@@ -87,7 +87,7 @@ def too_late(dut: Dut) -> None:
     partner = foreign_id(dut)
     consume(dut, partner, 100)
     dut.operational()
-    for _ in range(2):  # a new heartbeat restarts the monitoring
+    for _ in range(2):  # a new heartbeat restarts monitoring
         sent_ns = beat(dut, partner)
         frame = expect_emcy(dut, COMMUNICATION_LOST, "when a heartbeat is late")
         not_before(frame, sent_ns, 100, "EMCY 0x8130")

@@ -1,6 +1,6 @@
 """Conformance cases HBVG-01 to HBVG-07: heartbeat versus node guarding (CiA 301, 7.2.8.2.2).
 
-A device uses one of the two. If both are enabled, it uses the heartbeat.
+A device uses only one of these protocols. If both are enabled, it uses the heartbeat.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Mapping counts (PDO-25), signatures and the error field have rules of their own.
+        # Mapping counts (PDO-25), signatures and the error field have their own rules.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):

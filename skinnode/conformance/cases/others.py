@@ -1,4 +1,4 @@
-"""Conformance cases OTHER-01 to OTHER-10: storage, verify configuration (0x1020), restricted CAN-IDs."""
+"""Conformance cases OTHER-01 to OTHER-10: storage, verify configuration (0x1020) and restricted CAN-IDs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ RESTRICTED = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
-"""Ranges of restricted CAN-IDs (CiA 301, 7.3.5): NMT, default SDO, error control and reserved ones."""
+"""Ranges of restricted CAN-IDs (CiA 301, 7.3.5): NMT, default SDO, error control and reserved CAN-IDs."""
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Change 0x1015 and 0x1017; return the old values and the new values, by index."""
+    """Change 0x1015 and 0x1017; return the old and the new values, by index."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -50,7 +50,7 @@ def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
     """Check that a wrong signature is refused and has no effect, even after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
-    # A device that accepts a wrong signature has stored or restored parameters.
+    # A device that accepts a wrong signature may store or restore parameters.
     dut.stored = True
     for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
         request = expedited(index, subindex, signature)
@@ -180,7 +180,7 @@ def restricted(dut: Dut) -> None:
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
-    """Yield index and sub-index of the writable COB-IDs among SYNC, TIME, EMCY, first RPDO and first TPDO."""
+    """Yield index and sub-index of each writable COB-ID among SYNC, TIME, EMCY, first RPDO and first TPDO."""
     pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
     for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
         entry = dut.eds.find(index, subindex)

@@ -30,7 +30,7 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Waiting time after each SYNC for the first TPDO of a cycle, s; only then is the next SYNC sent."""
+"""Time to wait after each SYNC for the first TPDO of a cycle before the next SYNC is sent, s."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
@@ -152,7 +152,7 @@ def event_timer(dut: Dut) -> None:
         length = payload_bytes(mapped(dut, pdo))
         can_id = set_up(dut, pdo, PdoSetup(254))
         dut.operational()
-        # Events of the application may also trigger the PDO.
+        # Application events may also trigger the PDO.
         busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))
         dut.nmt(PRE_OPERATIONAL)
         set_up(dut, pdo, PdoSetup(254, event_ms=_EVENT_MS))

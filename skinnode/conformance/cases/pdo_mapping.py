@@ -1,4 +1,4 @@
-"""Conformance cases PDO-21 to PDO-33: default mapping of PDOs, remapping, and invalid mappings."""
+"""Conformance cases PDO-21 to PDO-33: default PDO mappings, remapping and invalid mappings."""
 
 from __future__ import annotations
 

@@ -31,9 +31,9 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that fits, except objects that accept only commands or certain values.
+    """Return the first entry for which ``fits`` is true, excluding the objects in ``_SPECIAL``.
 
-    Raises NotApplicable if there is none; ``lack`` describes the object for the message.
+    Raises NotApplicable if there is none; ``lack`` describes the missing object in the message.
     """
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
@@ -42,7 +42,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """Return a readable object longer than four bytes, preferably device name or version, and its value."""
+    """Return a readable object longer than four bytes, preferably a device name or version, and its value."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):
@@ -168,7 +168,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """Return ``limit + beyond`` as bytes; None if there is no limit or the value exceeds the data type."""
+    """Return ``limit + beyond`` as bytes; None if there is no limit or the value does not fit the type."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:

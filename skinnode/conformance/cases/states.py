@@ -1,4 +1,4 @@
-"""Conformance cases STATE-01 to STATE-04: the boot-up message, and the services of each NMT state."""
+"""Conformance cases STATE-01 to STATE-04: boot-up message, and services available in each NMT state."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def boot_up(dut: Dut) -> None:
 
 
 def _check_state(dut: Dut, state: int, what: str) -> None:
-    """Check the NMT state in heartbeats and in guarding responses, as far as the device supports them."""
+    """Check the NMT state in heartbeats and guarding responses, if the device supports them."""
     dut.start_heartbeat()
     dut.expect_state(state, what)
     if dut.eds.find(HEARTBEAT) is not None:
@@ -169,7 +169,7 @@ def stopped(dut: Dut) -> None:
 
 
 def _no_emcy(dut: Dut) -> None:
-    """Check that an RPDO without data causes no emergency message; in OPERATIONAL, it is an error."""
+    """Check that an RPDO without data, an error only in OPERATIONAL, triggers no emergency message."""
     dut.bus.pending(dut.emcy_id)
     dut.bus.send(0x200 + dut.node_id)
     dut.bus.expect_silence(dut.emcy_id, "emergency message in STOPPED")

@@ -18,7 +18,7 @@ _BUSY = (0x0800_0022,)
 
 
 def consume_only(dut: Dut) -> None:
-    """Stop the SYNC producer and set the period to 0; only then can the counter overflow value be written."""
+    """Stop the SYNC producer and set the period to 0, so that the counter overflow value can be written."""
     dut.need(COB_ID)
     dut.sdo.write_integer(COB_ID, 0, SYNC_ID, 4)
     if dut.eds.find(PERIOD) is not None:
@@ -78,7 +78,7 @@ def count(dut: Dut) -> None:
 
 
 def _synchronous(dut: Dut) -> Pdo:
-    """Return a TPDO that is synchronous by default; if there is none, the first TPDO that maps an object."""
+    """Return a TPDO that is synchronous by default or, failing that, the first TPDO that maps an object."""
     usable = [pdo for pdo in tpdos(dut) if mapped(dut, pdo)]
     if not usable:
         raise NotApplicable("no TPDO maps an object by default")

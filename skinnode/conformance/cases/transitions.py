@@ -1,4 +1,4 @@
-"""Conformance cases TRANS-01 to TRANS-04: NMT state transitions by reset, pre-operational, start and stop."""
+"""Conformance cases TRANS-01 to TRANS-04: NMT state transitions on reset, pre-operational, start and stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"
 
 
 def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
-    """Change one object from 0x2000 to 0x9FFF; return its entry and old value, or None if none changes."""
+    """Change one object from 0x2000 to 0x9FFF; return its entry and old value, or None if impossible."""
     for entry in dut.eds.between(0x2000, 0x9FFF):
         if not (entry.readable and entry.writable and entry.data_type in UNSIGNED and entry.size <= 4):
             continue

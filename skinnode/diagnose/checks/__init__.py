@@ -1,4 +1,4 @@
-"""Checks of the doctor: pure functions that derive findings from the facts about a bus.
+"""Doctor checks: pure functions that derive findings from the facts about a bus.
 
 Each module contains the checks of one area; ``run`` calls all of them.
 """

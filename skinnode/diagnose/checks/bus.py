@@ -1,4 +1,4 @@
-"""Doctor checks of a bus: interface, controller, load, masters and frames of unknown origin."""
+"""Doctor checks for a bus: interface, controller, load, masters and frames of unknown origin."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Fraction of SYNC counters out of sequence above which a second SYNC producer is reported.
+"""Fraction of out-of-sequence SYNC counters above which a second SYNC producer is reported.
 
-With two producers, about half of the counters do not follow the previous one. Lost SYNCs cause far fewer.
+With two producers, about half of the counters do not follow the previous one. Lost SYNCs cause far fewer such
+counters.
 """
 
 _BEATS: Final = 4
@@ -27,7 +28,7 @@ sender halves the measured period."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
-    """Check the interface, its controller, the load, the origin of frames, and nodes without a node-ID."""
+    """Check the interface, the controller, the load and frame origins; report nodes without a node-ID."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
@@ -93,7 +94,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_masters(bus: BusFacts) -> Iterator[Finding]:
-    """Check that only one master sends SYNC, the master's heartbeat and NMT commands."""
+    """Check that only one master sends SYNC, master heartbeats and NMT commands."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
@@ -106,7 +107,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "two SYNC producers",
             Sure.CERTAIN,
-            f"{astray} of {len(steps)} SYNC counters are not the successor of the previous counter",
+            f"{astray} of {len(steps)} SYNC counters do not follow the previous counter",
             stop_one,
         )
     if bus.master_beats_s is not None and len(bus.master_beats_s) >= _BEATS and bus.heartbeat_ms:

@@ -1,4 +1,4 @@
-"""Doctor checks of the nodes' configuration: EDS, layout, PDOs, inhibit time and heartbeat."""
+"""Doctor checks for the nodes' configuration: EDS, layout, PDOs, inhibit time and heartbeat."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """Compare PDOs and heartbeat with the host's settings, except values that the host will overwrite."""
+    """Compare the PDOs and the heartbeat with the host's settings, except values that the host overwrites."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:

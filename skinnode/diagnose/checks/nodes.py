@@ -1,4 +1,4 @@
-"""Doctor checks of the nodes: presence, identity, NMT state and errors."""
+"""Doctor checks for the nodes: presence, identity, NMT state and errors."""
 
 from __future__ import annotations
 

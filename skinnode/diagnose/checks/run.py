@@ -16,7 +16,7 @@ _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 
 def run_checks(facts: BusFacts) -> list[Finding]:
-    """Return all findings about a bus, in the order of the checks and then by certainty."""
+    """Return all findings about a bus, sorted by check and then by certainty."""
     checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
         bus.check_bus,
         bus.check_masters,
@@ -58,7 +58,7 @@ def others(facts: BusFacts) -> list[str]:
 
 
 def not_judged(facts: BusFacts) -> list[str]:
-    """Return one line for each check that could not be made, with the reason."""
+    """Return one line for each check that could not be performed, with the reason."""
     if facts.failure:
         return [f"{facts.name}: all checks except the interface check"]
     lines = []

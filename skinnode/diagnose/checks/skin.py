@@ -1,6 +1,6 @@
-"""Doctor checks of the skin: faulty wires, noise, jumps, frozen values and baseline.
+"""Doctor checks for the skin: faulty wires, noise, jumps, frozen values and baseline.
 
-The checks evaluate captured scans. Anything that a touch can explain is not reported.
+The checks evaluate captured scans. They report nothing that a touch could explain.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _check_crossings(
 
 
 def check_noise(bus: BusFacts) -> Iterator[Finding]:
-    """Check for frozen values, for more noise than stated, and for jumps."""
+    """Check for frozen values, excessive noise and jumps."""
     for patch, scans, analysis in _judged(bus):
         yield from _check_frozen(patch, scans)
         yield from _check_noise(patch, scans, analysis)
@@ -184,7 +184,7 @@ def _stands_out(levels: Float, wire: int) -> bool:
 
 
 def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
-    device = scans.device_us[scans.device_us >= 0] % TIME_WRAP_US  # the host added the bits above
+    device = scans.device_us[scans.device_us >= 0] % TIME_WRAP_US  # the host added the higher bits
     if len(device) >= LEAST_SCANS and len(np.unique(device)) == 1:
         yield Finding(
             "wires",
@@ -217,9 +217,10 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether no code changed, but the stated noise is too small for this to prove a fault.
+    """Return whether no code changed but the stated noise is too small for this to prove a fault.
 
-    False if the patch counts its conversions, because the count shows whether the converter is running.
+    Returns False if the patch counts its conversions, because the count shows whether the converter is
+    running.
     """
     if scans.conversions is not None:
         return False
@@ -233,7 +234,7 @@ def _shows(scans: ScanFacts) -> bool:
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Return masks of the crossings with a value in every scan, and of those whose value never changed."""
+    """Return masks of the crossings with a value in every scan and of those whose value never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 

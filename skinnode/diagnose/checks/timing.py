@@ -1,4 +1,4 @@
-"""Doctor checks of SYNC, of the duration of scans, and of lost frames."""
+"""Doctor checks for SYNC, scan durations and lost frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LATE: Final = 0.95
 
 
 def check_timing(bus: BusFacts) -> Iterator[Finding]:
-    """Check SYNC, and that scans end before the next SYNC."""
+    """Check SYNC, and check that scans end before the next SYNC."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)

@@ -246,9 +246,9 @@ class Replay:
 
     @property
     def place(self) -> tuple[int, int]:
-        """Current place in the recording, by which the fields are ordered.
+        """Current position in the recording, by which the fields are ordered.
 
-        The place consists of the number of frames read, and the number of buses whose last journal events
+        The position consists of the number of frames read and the number of buses whose last journal events
         have been applied.
         """
         return self._read, self._finished
@@ -270,7 +270,7 @@ class Replay:
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def layout(self, patch: str) -> PatchLayout:
-        """Return the layout with which a patch's scans are solved. Raises KeyError for an unknown patch."""
+        """Return the layout used to solve a patch's scans. Raises KeyError for an unknown patch."""
         config = self.hand.patch(patch)
         solver = self._buses[config.bus].solver(patch)
         return config.layout.build() if solver is None else solver.facts.layout

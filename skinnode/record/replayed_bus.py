@@ -78,7 +78,7 @@ class ReplayedBus:
             self._go_on(frame.can_id)
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
-            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # no fault, because the host commanded it
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # not a fault: the host commanded it
                 monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():

@@ -9,7 +9,7 @@ from skinnode.messages.full_field import SendStamp
 
 @dataclass(frozen=True, slots=True)
 class PatchCounts:
-    """Counters of a patch since the program connected."""
+    """Counters for a patch since the program connected."""
 
     received: int
     """Number of fields received."""
@@ -28,7 +28,7 @@ class PatchCounts:
 
 
 class PatchAccount:
-    """Received and lost fields of a patch. Only the receiver may call :meth:`add`."""
+    """Counts a patch's received and lost fields. Only the receiver may call :meth:`add`."""
 
     def __init__(self) -> None:
         self._received = self._lost = self._runs = self._sequence = 0

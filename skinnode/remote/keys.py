@@ -23,7 +23,7 @@ from skinnode.errors import ConfigError
 from skinnode.messages.typestore import typestore
 
 _NODE: Final = "skinnode"
-"""Name of the ROS 2 node as which the daemon appears."""
+"""Name of the ROS 2 node that represents the daemon."""
 _QOS: Final = "::,:,:,:,,"
 """rmw_zenoh's encoding of its default QoS: reliable, volatile, keep last 42 (``qos.cpp``)."""
 _HIGHEST_DOMAIN: Final = 232

@@ -27,7 +27,7 @@ _POLL_S: Final = 0.05
 
 
 class Counters(Protocol):
-    """Counters that a report contains."""
+    """Counters included in a health report."""
 
     @property
     def published(self) -> dict[str, int]:

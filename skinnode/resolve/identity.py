@@ -1,6 +1,7 @@
 """Describes the software of a process. Only processes with the same software compute bit-identical results.
 
-This module imports nothing from skinnode at the top, because the Dask client sends it to workers by value.
+This module imports nothing from skinnode at module level, because the Dask client sends it to workers by
+value.
 """
 
 from __future__ import annotations

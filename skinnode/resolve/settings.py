@@ -41,8 +41,8 @@ def variants(options: Sequence[str]) -> list[Variant]:
     """Return all combinations of option values.
 
     Args:
-        options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. A value is a TOML value; a value that is not
-            TOML is a string.
+        options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. Values are parsed as TOML; a value that is not
+            valid TOML is a string.
 
     Raises:
         ConfigError: An option has no key or no value, has a key that cannot be set, or occurs twice.
@@ -55,7 +55,7 @@ def variants(options: Sequence[str]) -> list[Variant]:
             raise ConfigError("--set", option, "KEY=VALUE, or KEY=VALUE,VALUE,… for a sweep")
         _check(key)
         if key in found:
-            raise ConfigError("--set", option, f"{key} only once; separate several values by commas")
+            raise ConfigError("--set", option, f"{key} only once; separate multiple values with commas")
         found[key] = [Setting(key, _value(part), part) for part in _split(text)]
     return list(itertools.product(*found.values()))
 
@@ -121,7 +121,7 @@ def _set(table: Any, path: list[str | int], setting: Setting) -> None:
             continue
         table = table.setdefault(part, {})
         if not isinstance(table, dict | list | tuple):
-            raise ConfigError("--set", setting.key, f"{part} itself, which is no table here")
+            raise ConfigError("--set", setting.key, f"{part} itself, which is not a table here")
     table[path[-1]] = setting.value
 
 
@@ -133,7 +133,7 @@ def _value(text: str) -> Any:
 
 
 def _split(text: str) -> list[str]:
-    """Split a text at the commas outside brackets and quotes."""
+    """Split a string at the commas outside brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for character in text:
         if quote:

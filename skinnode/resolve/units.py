@@ -21,7 +21,7 @@ from skinnode.resolve.scan_capture import Capture, CaptureSummary
 
 @dataclass(frozen=True)
 class Unit:
-    """Work whose result is one part file.
+    """Piece of work that results in one part file.
 
     Attributes:
         recording: The recording.
@@ -61,7 +61,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class CaptureScans(Unit):
-    """Unit that assembles the scans of some buses. Its part has the summary; each patch has its own part.
+    """Unit that assembles the scans of some buses. Each patch has its own part.
 
     Attributes:
         buses: Names of the buses.
@@ -137,7 +137,7 @@ class ResultSummary:
     faults: tuple[str, ...]
     """Messages about missing or unreadable parts of the recording, and about lost frames and scans."""
     notes: tuple[str, ...]
-    """Assumptions that were made because there is no journal."""
+    """Assumptions made because there is no journal."""
 
 
 @dataclass(frozen=True)

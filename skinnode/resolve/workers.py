@@ -26,8 +26,8 @@ class Workers(Protocol):
         """
 
     def close(self) -> None:
-        """End the running units and the workers."""
+        """Stop the running units and the workers."""
 
 
 MOST_DEATHS = 3
-"""Number of worker deaths while running the same unit after which the unit fails."""
+"""Number of workers lost while running the same unit after which the unit fails."""

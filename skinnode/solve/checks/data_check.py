@@ -40,12 +40,12 @@ WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
 SUSPICIOUS: Final = 5.0
-"""Gain in log evidence (nats) from assuming a fault, above which a frame is suspicious. The check examines
+"""Gain in log evidence (nats) from assuming a fault above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
 """Steps in κ below the best-fitting value at which single readings are tested."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Similar
+"""Log evidence of faults minus that of loads (nats) below which loads clearly explain a frame. Similar
 frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
 """Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
@@ -81,7 +81,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A field, and the readings from which it was computed."""
+    """A field and the readings from which it was computed."""
 
     field: FieldFrame
     a: Float
@@ -93,7 +93,7 @@ class Solved:
 
 
 class DataCheck:
-    """Data check of one patch, frame by frame. Each stream needs its own instance.
+    """Checks the readings of one patch frame by frame. Each stream needs its own instance.
 
     Args:
         problem: The patch.
@@ -160,7 +160,7 @@ class DataCheck:
         return self._list.mask
 
     def pass_frame(self) -> None:
-        """Count a frame that is not checked, because the patch is untouched."""
+        """Count a frame that is not checked because the patch is untouched."""
         self._frame += 1
 
     def check(
@@ -177,7 +177,7 @@ class DataCheck:
             until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A suspicious frame
                 that cannot be examined in time is not trusted; every :data:`PATIENCE`-th such frame is
                 examined regardless. Pass −inf if the solver ran out of time: wires without a solution are
-                then not taken for faulty.
+                then not considered faulty.
         """
         self._frame += 1
         last = self._last
@@ -310,7 +310,7 @@ class DataCheck:
         return found
 
     def _may_examine(self, gain: float, until: float) -> bool:
-        """Return whether a suspicious frame may be examined in view of the deadline.
+        """Return whether to examine a suspicious frame, given the deadline.
 
         If there is no time, the frame is marked as unexamined. It is not marked if a similar frame was
         examined recently and found to be free of faults.
@@ -339,7 +339,7 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame if its noise is above the stated level.
+        """Return the log evidence of the frame, assuming that its noise is above the stated level.
 
         If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
         ln(ratio) for each reading.

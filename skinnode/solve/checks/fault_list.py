@@ -78,7 +78,7 @@ class FaultList:
         return found
 
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
-        """Record the groups of wrong readings of a frame, and return the faults that are not yet confirmed.
+        """Record the groups of wrong readings in a frame and return the faults that are not yet confirmed.
 
         Args:
             groups: Groups of wrong readings.

@@ -4,8 +4,8 @@ The search is a form of batch orthogonal matching pursuit. Its dictionary is A =
 each of the m readings and one for the readings' response to each of the 4Q loads. The search needs Aᵀ P z and
 the diagonal of the Gram matrix E = Aᵀ P A. Adding a load, or leaving out a reading, is a rank-one update of
 the precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it
-updates Aᵀ P z and the diagonal. Of P' itself, only the block of each wire is computed; the blocks are needed
-to test whether all readings of a wire are wrong.
+updates Aᵀ P z and the diagonal. Only each wire's block of P' itself is computed; the blocks are needed to
+test whether all readings of a wire are wrong.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ Mask = NDArray[np.bool_]
 class GreedySearch:
     """Greedy search. Each stream needs its own instance.
 
-    The work arrays (3 MB for the reference patch) exist only during a search, because a stream is seldom
-    searched.
+    The work arrays (3 MB for the reference patch) exist only during a search, because searches are rare.
 
     Args:
         model: Joint distribution of the readings.

@@ -47,7 +47,7 @@ class Growth:
     """Standard deviation of the patch's steady drift after one hour, divided by the noise."""
 
     def after(self, seconds: float) -> tuple[float, float]:
-        """Return the growth of a wire's variance and of the patch's variance in ``seconds``."""
+        """Return the growth of a wire's variance and of the patch's variance over ``seconds`` seconds."""
         hours, steady_h = seconds / 3600.0, max(seconds - MEASURED_S, 0.0) / 3600.0
         return (
             hours * self.drift**2 + (steady_h * self.steady) ** 2,
@@ -77,13 +77,13 @@ class GainFilter:
     """(V, V) matrix whose element-wise product with the covariance of v, summed over all elements, is the
     variance of an upper wire's gain about the mean of the upper wires."""
     of_lowers: Float
-    """(V, V) matrix for the lower wires, like ``of_uppers``."""
+    """(V, V) matrix like ``of_uppers``, but for the lower wires."""
     of_mean: Float
     """(V,) coefficients of the mean change in all readings."""
 
     @classmethod
     def of(cls, shape: tuple[int, int], ratios: bytes) -> GainFilter:
-        """Return the filter of a patch from a cache.
+        """Return the cached filter of a patch.
 
         Args:
             shape: Numbers U and K of upper and lower wires.

@@ -1,4 +1,4 @@
-"""Touch test of a frame: the statistic of :mod:`skinnode.solve.detect.touch_statistic`, and its thresholds.
+"""Touch test for a frame: the statistic of :mod:`skinnode.solve.detect.touch_statistic`, and its thresholds.
 
 The thresholds follow from the distribution of the statistic without a touch
 (:mod:`skinnode.solve.detect.weighted_chi_squared`). In the mean of w successive frames, the squared
@@ -50,7 +50,7 @@ class Thresholds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TouchTest:
-    """Touch test for one patch, one false-alarm rate and one uncertainty of the gains."""
+    """Touch test for one patch, one false-alarm rate and one level of gain uncertainty."""
 
     statistic: Statistic
     """Statistic."""
@@ -64,7 +64,7 @@ class TouchTest:
 
 
 class TouchTests:
-    """Touch tests of one patch for all uncertainties of the gains.
+    """Touch tests of one patch for all levels of gain uncertainty.
 
     Args:
         basis: Features and statistics of the patch.
@@ -93,7 +93,7 @@ class TouchTests:
         return found
 
     def prepare(self) -> None:
-        """Compute all tests, so that none delays a frame."""
+        """Compute all tests in advance, so that none of them delays a frame."""
         for wires in range(len(WIRE_VARIANCES)):
             for patch in range(len(PATCH_VARIANCES)):
                 self.test(wires, patch)
@@ -125,7 +125,7 @@ def touch_tests(
 
 @functools.lru_cache(maxsize=4096)
 def _thresholds(basis: TouchBasis, wires: int, patch: int, chance: float) -> tuple[Thresholds, Thresholds]:
-    """Return the thresholds for noise that is independent in each frame, and for noise that is not."""
+    """Return the thresholds for noise that is independent in each frame, and for noise that never changes."""
     statistic = basis.statistic(wires, patch)
     one, three = statistic.weights, statistic.weights_of_mean(WINDOWS[1])
     four = statistic.weights_of_mean(RELEASE_FRAMES)

@@ -23,7 +23,7 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Numbers of substeps of successive bridges.
+"""Numbers of substeps in successive bridges.
 
 On the staggered layout (h = 0.5), 3 substeps solved every wire after a press of 50 % of h within one frame; 5
 substeps solved 23 of 24 wires after a press of 70 %. Adaptive substeps that stay on the branch of the rest
@@ -34,7 +34,7 @@ BRIDGE_TOLERANCE: Final = 1e-6
 BRIDGE_STEPS: Final = 20
 """Maximum number of solver steps per substep."""
 RECOVERY_STEPS: Final = 300
-"""Number of solver steps in a frame (about 15 ms) above which no further bridge is started.
+"""Number of solver steps per frame, about 15 ms, above which no further bridge is started.
 
 The limit prevents a corrupt frame from stalling the stream.
 """

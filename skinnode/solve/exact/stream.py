@@ -1,4 +1,4 @@
-"""State of a stream that the modules of the exact tracker share: solver, arrays and acceptance of roots.
+"""State of a stream, shared by the exact tracker's modules: solver, arrays and acceptance of roots.
 
 A root of F = b is accepted only if it passes two tests. Each electrode must be within its clearance of its
 rest position; the clearance is its distance at rest from the nearest lower electrode. The determinant of J

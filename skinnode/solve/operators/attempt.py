@@ -1,4 +1,4 @@
-"""Attempt of ``solve_system``: runs an operator with one initial trust region, and classifies the last point.
+"""Attempt of ``solve_system``: runs an operator with one initial trust region and classifies the last point.
 
 The compiled loop reports CONVERGED at roots and near stationary points of ‖r‖. An attempt then decides
 whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
@@ -30,7 +30,7 @@ of Brown & Dennis.
 
 
 class System:
-    """Wrapper of the caller's functions that counts the calls and validates the returned arrays.
+    """Wrapper around the caller's functions that counts calls and validates the returned arrays.
 
     The returned array can be the caller's own, which the next call may overwrite.
     """

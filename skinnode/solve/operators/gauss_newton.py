@@ -112,7 +112,7 @@ def estimate_error(w: Work, inverse: Float) -> float:
     """Write J⁺, with the last factors of J, into ``inverse`` (n, m); return an estimate of the error of x.
 
     The estimate is relative to max(1, ‖x‖∞). It is the sum of the last Newton correction and the error due to
-    rounding of x, which grows with the condition number of J. If J is singular, it is inf.
+    rounding of x, which grows with the condition number of J. If J is singular, the estimate is inf.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -26,7 +26,7 @@ DIFFERENCE: Final = EPS ** (1 / 3)
 NOISE: Final = EPS ** (2 / 3)
 """Relative rounding error of a central difference with the step :data:`DIFFERENCE`."""
 CURVED: Final = 0.05
-"""Limit above which the smallest scaled eigenvalue of the Hessian counts as positive.
+"""Limit above which the smallest scaled eigenvalue of the Hessian is considered positive.
 
 On the problems of Moré, Garbow & Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38
 at isolated minima. The exception is Watson's problem with n = 12: because of rounding errors, it is 0.003 at
@@ -41,7 +41,7 @@ NEWTON_STEPS: Final = 8
 
 @dataclass(frozen=True)
 class Point:
-    """A point with its residual and Jacobian."""
+    """A point, its residual and its Jacobian."""
 
     x: Float
     r: Float
@@ -166,6 +166,6 @@ def settle(
         if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
             break
         before, at = size, Point(x, r, jacobian(x))
-    # If Jᵀr consists of rounding errors only, the steps no longer contract, but the point is stationary.
+    # If Jᵀr consists only of rounding errors, the steps no longer contract, but the point is stationary.
     known = bent.positive and (reached or at.cosine <= STATIONARY)
     return Settled(at, bent.lowest, size + bent.error if known else math.inf)

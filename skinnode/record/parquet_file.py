@@ -84,7 +84,7 @@ def read_parquet(path: Path) -> tuple[str, Iterator[FieldRow]]:
     """Open a Parquet field table.
 
     Returns:
-        First line of the journal, which contains the hand; and the rows.
+        The journal's first line, which contains the hand, and the rows.
 
     Raises:
         ConfigError: The file is not a Parquet field table, or has a different version.

@@ -202,7 +202,7 @@ class Recorder:
     # --- methods for the data that only an MCAP file can contain; see follow()
 
     def field(self, field: FieldFrame) -> None:
-        """Record a field and its contacts. Any thread."""
+        """Record a field and its contacts; callable from any thread."""
         file, log_ns = self._mcap, clock.monotonic_ns() + self._offset_ns
         if file is None or field.stamp is None:
             return
@@ -213,13 +213,13 @@ class Recorder:
         self._fields_lost += not self._put(entry, 0)
 
     def health(self, patches: Mapping[str, PatchHealth], buses: Mapping[str, BusHealth]) -> None:
-        """Record the health of all patches and buses. Any thread."""
+        """Record the health of all patches and buses; callable from any thread."""
         if self._mcap is not None:
             log_ns = clock.monotonic_ns() + self._offset_ns
             self._put(partial(self._mcap.write_health, patches, buses, log_ns), 0)
 
     def event(self, event: HealthEvent) -> None:
-        """Record an event. Any thread."""
+        """Record an event; callable from any thread."""
         if self._mcap is not None:
             log_ns = clock.monotonic_ns() + self._offset_ns
             self._put(partial(self._mcap.write_event, event, self._offset_ns, log_ns), 0)

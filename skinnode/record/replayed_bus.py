@@ -86,7 +86,7 @@ class ReplayedBus:
         self._dispatcher.measure(frame.t_ns)
 
     def _go_on(self, can_id: int) -> None:
-        """Resume with the same solver after a node restart; no journal records when the host resumed.
+        """Resume with the same solver after a node restart; a log alone does not show when the host resumed.
 
         After a baseline change, scans remain withheld, because the new baseline is unknown.
         """

@@ -14,7 +14,7 @@ class PatchCounts:
     received: int
     """Number of fields received."""
     lost: int
-    """Number of fields that the daemon sent but that did not arrive, from gaps in the sequence numbers."""
+    """Number of fields that the daemon sent but that did not arrive, as shown by sequence number gaps."""
     runs: int
     """Number of daemon runs from which fields have arrived."""
     sequence: int

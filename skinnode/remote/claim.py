@@ -55,5 +55,5 @@ class Claim(Closing):
             if other == self.hand.name:
                 allowed = "a hand that no other daemon publishes (end the other daemon, or set another name)"
             else:
-                allowed = f"a name that differs in letters or digits from the published hand {other!r}"
+                allowed = f"a name that differs from the published hand {other!r} in letters or digits"
             raise ConfigError("name", self.hand.name, allowed, where=self.hand.where("name"))

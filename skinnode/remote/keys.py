@@ -31,7 +31,7 @@ _HIGHEST_DOMAIN: Final = 232
 
 
 def domain() -> int:
-    """Return the ROS 2 domain, from the environment variable ``ROS_DOMAIN_ID``; 0 by default.
+    """Return the ROS 2 domain given by the environment variable ``ROS_DOMAIN_ID``; 0 by default.
 
     Raises:
         ConfigError: if the variable is not an integer from 0 to 232.

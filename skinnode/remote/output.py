@@ -56,7 +56,7 @@ class Output:
         return bool(getattr(status, "matching", status))
 
     def send(self, data: bytes, sent_ns: int) -> None:
-        """Publish a message. Never waits.
+        """Publish a message without waiting.
 
         Args:
             data: CDR-encoded message.

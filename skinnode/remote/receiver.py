@@ -1,4 +1,4 @@
-"""Decodes a daemon's messages in a separate thread, and passes them on."""
+"""Decodes a daemon's messages in a separate thread and passes them on."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Recipients:
     report: Callable[[HealthReport], None]
     event: Callable[[HealthEvent], None]
     on_turn: Callable[[], None]
-    """Called between two messages."""
+    """Called between messages."""
 
 
 class _Item(NamedTuple):
@@ -84,7 +84,7 @@ class Receiver:
         ]
 
     def close(self) -> None:
-        """Stop receiving, and wait for the thread to end."""
+        """Stop receiving and wait for the thread to end."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._inbox.put(End())

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import zenoh
 
 SILENT_S: Final = 1.0
-"""Maximum age of the newest health report, s; then the daemon is silent. It sends four reports per second."""
+"""Maximum age of the newest health report, s. The daemon sends four reports per second."""
 _RESET_S: Final = 1.0
 
 

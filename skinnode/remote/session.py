@@ -50,7 +50,7 @@ _ENDPOINT: Final = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[^\]]+\]|[^/:\[\]]+):(\
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """Connections of a daemon or a program.
+    """Connection options of a daemon or a program.
 
     Raises:
         ConfigError: if an endpoint is malformed or a number is out of range.
@@ -83,7 +83,7 @@ class SessionOptions:
 
 
 def host_of(option: str, endpoint: str) -> str:
-    """Return the host in an endpoint.
+    """Return the host part of an endpoint.
 
     Args:
         option: Name of the option, for the error message.

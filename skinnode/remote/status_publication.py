@@ -69,7 +69,7 @@ class StatusPublication:
         self._thread.start()
 
     def close(self) -> None:
-        """Send the pending events, and wait for the thread to end."""
+        """Send the pending events and wait for the thread to end."""
         self._over.set()
         self._thread.join()
 
@@ -89,7 +89,7 @@ class StatusPublication:
         return True
 
     def _report(self) -> None:
-        """Find the topics that have subscribers, and send the health and the poses."""
+        """Find the topics that have subscribers; send the health and the poses."""
         now_ns = clock.time_ns()
         self.wall_minus_mono_ns = now_ns - clock.monotonic_ns()
         outputs, host = self._outputs, self._host

@@ -133,6 +133,6 @@ def beside(path: Path) -> Path:
 
 
 def put_in_place(temporary: Path, path: Path) -> None:
-    """Rename a complete file to its final name, and flush its folder to disk."""
+    """Rename a complete file to its final name and flush its folder to disk."""
     os.replace(temporary, path)
     flush_folder(path.parent)

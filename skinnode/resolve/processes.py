@@ -110,7 +110,7 @@ class Processes(Closing):
         return child
 
     def _bury(self, child: _Child, unit: Unit | None) -> None:
-        """Remove a process that has ended, and queue its unit again."""
+        """Remove a process that has ended and queue its unit again."""
         child.process.join(_END_S)
         status = child.process.exitcode
         child.connection.close()
@@ -127,7 +127,7 @@ class Processes(Closing):
 
 
 def _work(parent: Connection, folder: str, expected: dict[str, str]) -> None:
-    """Run units until the parent process closes its end of the pipe or ends."""
+    """Run units until the parent process exits or closes its end of the pipe."""
     import signal
 
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""Identifies a recording, and opens it with the hand of a variant."""
+"""Identifies a recording and opens it with the hand of a variant."""
 
 from __future__ import annotations
 

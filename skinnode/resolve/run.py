@@ -1,4 +1,4 @@
-"""Runs the jobs of a plan, and continues where an earlier run stopped."""
+"""Runs the jobs of a plan and continues where an earlier run stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Assembles the scans of a recording with the host's code, and stores them for solving later."""
+"""Assembles the scans of a recording with the host's code and stores them for solving later."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class CapturedScan:
 
     place: Place
     now_ns: int
-    """Time of the replay at which the scan is solved, on the host's monotonic clock, ns."""
+    """Replay time at which the scan is solved, on the host's monotonic clock, ns."""
     scan: Scan
     stamp: ScanStamp
     verdict: Verdict

@@ -1,4 +1,4 @@
-"""Parses ``--set`` options, and applies them to the hand of a recording."""
+"""Parses ``--set`` options and applies them to the hand of a recording."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skinnode.config import HandConfig, PatchConfig, SolverConfig, parse_hand
 from skinnode.errors import ConfigError
 
 _PATCH_KEYS: Final = ("relative_noise", "calibration", "tolerances", "layout")
-"""Keys of a patch that describe its skin rather than its identity on the bus."""
+"""Patch keys that describe the skin rather than the patch's identity on the bus."""
 _EVERY_PATCH: Final = "*"
 _ALLOWED: Final = (
     "solver.KEY, or patches.NAME.KEY, where NAME is a patch or * for all, "
@@ -20,7 +20,7 @@ _ALLOWED: Final = (
 )
 _WITHOUT_LIMIT: Final = "no time limit, because the results would depend on the speed of the computer"
 _LIVE: Final = {"deadline_us": _WITHOUT_LIMIT, "workers": "--processes instead"}
-"""Keys of the solver that only a live host uses."""
+"""Solver keys used only by a live host."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _patch_and_key(key: str) -> tuple[str, list[str]]:
 
 
 def _paths(hand: HandConfig, setting: Setting) -> list[list[str | int]]:
-    """Return the paths in the table of a hand that a setting changes."""
+    """Return the paths in a hand's table that a setting changes."""
     if setting.key.startswith("solver."):
         return [list(setting.key.split("."))]
     name, keys = _patch_and_key(setting.key)

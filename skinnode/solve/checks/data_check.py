@@ -34,8 +34,7 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Limit on the groups of readings left out of a frame. Once the limit is reached, the frame is not solved
-again."""
+"""Maximum number of groups of readings left out of a frame. The frame is then not solved again."""
 WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
@@ -43,13 +42,12 @@ SUSPICIOUS: Final = 5.0
 """Gain in log evidence (nats) from assuming a fault above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Steps in κ below the best-fitting value at which single readings are tested."""
+"""Values of κ at which single readings are tested, in steps below the best-fitting value."""
 CLEAR: Final = -30.0
 """Log evidence of faults minus that of loads (nats) below which loads clearly explain a frame. Similar
 frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
-"""Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
-to count as similar."""
+"""Maximum excess (nats) of a frame's gain over that of an examined frame for the two frames to be similar."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames for which the result of an examination also applies to similar frames. Each examination
 takes 9 ms."""
@@ -166,7 +164,7 @@ class DataCheck:
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Check the readings of a frame, and return its field with the faults found and the trust decision.
+        """Check the readings of a frame; return its field with the faults found and the trust decision.
 
         If readings are found to be wrong, the returned field is that of a new solve without them.
 
@@ -365,7 +363,7 @@ class DataCheck:
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:
-        """Write the linearised changes, in units of the noise, into ``_z``, and return the relative noise."""
+        """Write the linearised changes, in units of the noise, into ``_z``; return the relative noise."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
@@ -463,7 +461,7 @@ class DataCheck:
         return groups if len(groups) <= COARSE_GROUPS else groups[:1]
 
     def _follow(self, solved: Solved) -> None:
-        """Compare the readings that have a confirmed fault with the field, and update the fault list."""
+        """Compare the readings that have a confirmed fault with the field and update the fault list."""
         self._list.follow(*self._deviations(solved))
 
     def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
@@ -508,6 +506,6 @@ def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
 
 
 def _still(solved: Solved, last: FieldFrame) -> bool:
-    """Return whether all wires were held, and no status has changed since the last field."""
+    """Return whether all wires were held and no status has changed since the last field."""
     held = solved.field.held
     return held is not None and bool(held.all()) and solved.field.status == last.status

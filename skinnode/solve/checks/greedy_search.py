@@ -227,7 +227,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
-    """Copy the block of P of each upper and lower wire into ``of_upper`` and ``of_lower``."""
+    """Copy each upper and lower wire's block of P into ``of_upper`` and ``of_lower``."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         for i in range(lower):
@@ -241,7 +241,7 @@ def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
 
 @njit
 def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -> None:
-    """Subtract share · v vᵀ from the block of each upper and lower wire."""
+    """Subtract share · v vᵀ from each upper and lower wire's block."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         block, first = of_upper[u], u * lower

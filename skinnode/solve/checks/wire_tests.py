@@ -38,7 +38,7 @@ Mask = NDArray[np.bool_]
 class WireTables:
     """Cholesky factors of each wire's blocks of P and S, at one κ.
 
-    The arrays for upper wires have the shape (U, K, K), those for lower wires (K, U, U).
+    The arrays have the shape (U, K, K) for upper wires and (K, U, U) for lower wires.
     """
 
     upper_p: Float

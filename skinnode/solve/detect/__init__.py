@@ -1,4 +1,4 @@
-"""Touch detection: decides, before solving, if a patch is touched and which frames need not be solved.
+"""Touch detection: decides, before solving, whether a patch is touched and which frames to solve.
 
 ``touch_detector`` makes the decision for each frame. It uses ``touch_test`` (the thresholds of the test
 statistic), ``touch_statistic`` (the statistic), ``touch_kernel`` (the compiled part), ``touch_odds`` (the

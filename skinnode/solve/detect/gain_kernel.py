@@ -39,7 +39,7 @@ class GainArrays(ArrayTable):
     expected: Annotated[NDArray[np.float64], "m"]
     """Changes expected without a touch."""
     offset: Annotated[NDArray[np.float64], "m"]
-    """Part of ``expected`` that the gains do not cause."""
+    """Part of ``expected`` not caused by the gains."""
     covariance: Annotated[NDArray[np.float64], "V V"]
     """Covariance of v after the newest frame in the estimate."""
     v: Annotated[NDArray[np.float64], "V"]

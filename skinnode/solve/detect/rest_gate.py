@@ -64,7 +64,7 @@ class RestGate:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the state of the stream."""
         self.detector.reset()
         self._verdict = TouchVerdict(None, 0.0, False)
         self._field: FieldFrame | None = None

@@ -97,7 +97,7 @@ class SlowState:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the state of the stream."""
         gains = sum(self._shape) + 1
         its = self._arrays
         its.v[:], its.offset[:], its.expected[:] = 0.0, 0.0, 0.0

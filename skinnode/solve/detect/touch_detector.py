@@ -156,7 +156,7 @@ class TouchDetector:
         self._use_test()
 
     def prepare(self) -> None:
-        """Compute all tests, so that none delays a frame. Patches with the same layout share the tests."""
+        """Compute all tests in advance, to avoid delays. Patches with the same layout share the tests."""
         self._tests.prepare()
 
     def _use_test(self) -> None:

@@ -24,9 +24,9 @@ from skinnode.solve.detect.touch_statistic import (
 from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
 WINDOWS: Final = (1, 3)
-"""Numbers of frames in the means that are tested for the onset of a touch."""
+"""Numbers of frames averaged in the tests for the onset of a touch."""
 RELEASE_FRAMES: Final = 4
-"""Number of frames in the mean that is tested for the release of a touch."""
+"""Number of frames averaged in the test for the release of a touch."""
 RELEASE_CHANCE: Final = 0.01
 """Probability that noise alone delays the release of a touch by one frame."""
 CHANGE_CHANCE: Final = 1e-6
@@ -125,7 +125,7 @@ def touch_tests(
 
 @functools.lru_cache(maxsize=4096)
 def _thresholds(basis: TouchBasis, wires: int, patch: int, chance: float) -> tuple[Thresholds, Thresholds]:
-    """Return the thresholds for noise that is independent in each frame, and for noise that never changes."""
+    """Return the thresholds for independent noise, and for noise that is the same in all frames."""
     statistic = basis.statistic(wires, patch)
     one, three = statistic.weights, statistic.weights_of_mean(WINDOWS[1])
     four = statistic.weights_of_mean(RELEASE_FRAMES)

@@ -53,7 +53,7 @@ def upper_quantile(weights: Float, probability: float) -> float:
 
 @njit_part
 def _saddle_point(weights: Float, value: float) -> float:
-    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, by Newton's method within two bounds."""
+    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, found by Newton's method within bounds."""
     largest = 0.0
     for i in range(weights.size):
         largest = max(largest, weights[i])

@@ -82,7 +82,7 @@ def _described(
         clock.sleep(_POLL_S)
     if present:
         raise SkinError(
-            f"hand {hand!r}: its daemon is starting and has not described the hand; connect again"
+            f"hand {hand!r}: its daemon is starting and has not described the hand yet; connect again"
         )
     others = published_hands(session)
     if others:

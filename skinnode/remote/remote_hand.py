@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     import zenoh
 
 SILENT_S: Final = 1.0
-"""Maximum age of the newest health report, s. The daemon sends four reports per second."""
+"""Time without a health report after which the daemon is considered silent, s. The daemon sends four reports
+per second."""
 _RESET_S: Final = 1.0
 
 

@@ -124,7 +124,7 @@ def require_protected(options: SessionOptions, *, commands: bool) -> None:
         ConfigError: if the daemon accepts commands over a non-local endpoint without TLS.
     """
     if commands and options.exposed is not None:
-        allowed = "only with endpoints of this machine, or tls/… with --zenoh-config"
+        allowed = "only with endpoints on this machine, or tls/… with --zenoh-config"
         raise ConfigError("--commands", Shown(options.exposed), allowed)
 
 
@@ -154,7 +154,7 @@ def open_daemon(options: SessionOptions) -> zenoh.Session:
         _settle(session, options, port)
         return session
     last = options.port + PORTS - 1
-    raise ConfigError("--port", options.port, f"a free port of {options.port} to {last} (all are {taken})")
+    raise ConfigError("--port", options.port, f"a free port from {options.port} to {last} (all are {taken})")
 
 
 def open_program(options: SessionOptions, end_s: float | None) -> zenoh.Session:

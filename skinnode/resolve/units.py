@@ -61,7 +61,9 @@ class Unit:
 
 @dataclass(frozen=True)
 class CaptureScans(Unit):
-    """Unit that assembles the scans of some buses. Each patch has its own part.
+    """Unit that assembles the scans of some buses.
+
+    Its part contains the summary; the scans of each patch have a part of their own.
 
     Attributes:
         buses: Names of the buses.

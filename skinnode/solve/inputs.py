@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""Relative noise above which a resistance is unusable; its square does not overflow."""
+"""Relative noise above which a resistance is unusable. The square of this value does not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

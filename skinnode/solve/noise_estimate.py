@@ -48,7 +48,7 @@ PAUSE: Final = 12
 """Number of frames skipped once a full window agrees with its last block.
 
 This is also the maximum number of frames skipped after rejected blocks. Without skipping, the noise estimate
-would take 8 % of the computing time of a patch at rest.
+would take 8 % of the computing time for a patch at rest.
 """
 REPEATED: Final = 0.15
 """Fraction of exactly repeated readings above which the contrasts of a block do not measure the noise.
@@ -97,7 +97,7 @@ _ITERATIONS: Final = 30
 _ONE_CODE: Final = 12.5
 """Maximum squared contrast of a reading that changes by one code, in units of the quantization variance."""
 _HALF_A_CODE: Final = 4.0
-"""Variance of the quantization error and a noise of half a code together, in units of the quantization
+"""Combined variance of the quantization error and a noise of half a code, in units of the quantization
 variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
@@ -179,8 +179,7 @@ def assess_block(
         frames: (4, U, K) resistances, ohm; NaN if invalid.
         noise: (U, K) stated relative standard deviation of the resistances, excluding quantization.
         rounding_ohm: (U, K) standard deviation of the quantization error, ohm; 0 if unknown.
-        quadratic: (U K,) workspace.
-        cubic: (U K,) workspace.
+        quadratic: (U K,) work array. cubic: (U K,) work array.
 
     Returns:
         The number of changed readings, or 0 if the block is rejected; the variance of the quadratic contrast

@@ -54,7 +54,7 @@ class EstimateOptions:
             unknowns.
         hold: Whether to keep the last solution of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed it by the duration of one solver step.
+        deadline_us: Time limit for an update, µs; an update can exceed it by the duration of one solver step.
             Wires that are unsolved at the deadline have the status DEADLINE.
         prior: Prior of the loads after the posterior has found a touch: ``cells`` for one variance per cell,
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
@@ -102,7 +102,7 @@ class EstimateOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: ``scale_m``, and those of :class:`EstimateOptions`.
+    """Options of :class:`skinnode.Posterior`: ``scale_m`` and those of :class:`EstimateOptions`.
 
     Args:
         scale_m: RMS normal displacement in the prior, metres; by default, it is estimated from the data.
@@ -128,7 +128,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: the following, and those of :class:`EstimateOptions`.
+    """Options of :class:`skinnode.Tracker`: the following and those of :class:`EstimateOptions`.
 
     Only the posterior supports ``drift``, ``model_error``, ``tolerances`` and ``estimate_noise``. If any of
     them is set, ``auto`` selects the posterior.

@@ -34,7 +34,8 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Maximum number of groups of readings left out of a frame. The frame is then not solved again."""
+"""Maximum number of groups of readings left out of a frame. Once the limit is reached, the frame is not
+solved again."""
 WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
@@ -52,8 +53,8 @@ EXCUSED_FRAMES: Final = 8
 """Number of frames for which the result of an examination also applies to similar frames. Each examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""One in this many suspicious frames is examined even if the deadline leaves no time. A fault makes every
-subsequent frame suspicious; a press rarely does."""
+"""Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
+makes every subsequent frame suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Assumed duration of the first examination, s. Later examinations are timed."""
 CROSSED_FRAMES: Final = 5

@@ -19,8 +19,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, out of the last :data:`WITHIN`, in which a fault must be found to be confirmed. Not
-tuned."""
+"""Number of frames, out of the last :data:`WITHIN`, in which a fault must be found before it is confirmed.
+Not tuned."""
 WITHIN: Final = 10
 """Number of successive frames in which the detections of a fault are counted."""
 ADMIT: Final = 64

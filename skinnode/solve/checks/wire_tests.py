@@ -106,7 +106,7 @@ class WireFinding:
     wire: int
     """Index of the wire: 0 to U − 1 for upper wires, U to U + K − 1 for lower wires."""
     factor: float
-    """Error common to all readings of the wire, in units of their noise; nan if the readings of the wire
+    """Error common to all readings of the wire, in units of their noise; NaN if the readings of the wire
     appear unrelated to those of the other wires."""
 
 

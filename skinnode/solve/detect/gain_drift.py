@@ -69,7 +69,8 @@ class GainFilter:
     basis_t: Float
     """(V, m) matrix Qᵀ with orthonormal rows."""
     to_gains: Float
-    """(U + K + 1, V) gains for given v. A combination of gains that affects no reading is zero."""
+    """(U + K + 1, V) matrix that converts v to gains. A combination of gains that affects no reading is
+    zero."""
     by_wires: Float
     """(V, V) covariance of v if the gains of all wires have a variance of 1."""
     by_patch: Float

@@ -46,7 +46,8 @@ NOISE_FRAMES: Final = 400
 NOISE_START: Final = 30
 """Weight of the stated noise, in frames."""
 QUIETER: Final = 0.6
-"""Ratio of a touched frame's noise variance to the average below which the average is presumed too large."""
+"""Ratio of a touched frame's noise variance to the average below which the average is considered too
+large."""
 NOISE_STEP: Final = 1.25
 """Maximum factor between the average and a frame's noise variance; larger deviations are clipped."""
 

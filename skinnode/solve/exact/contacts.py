@@ -77,7 +77,7 @@ class LoadFactors:
 
 
 class ExactContacts:
-    """Estimator of the contacts in a stream of exact fields; each stream needs its own instance.
+    """Estimates the contacts in a stream of exact fields; each stream needs its own instance.
 
     Args:
         layout: The patch.
@@ -280,7 +280,7 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
     ratio: Float,
     ordered: Float,
 ) -> tuple[float, float, bool]:
-    """Find the largest displacement in a field, and detect wires with unusually large standard deviations.
+    """Find the largest displacement in a field and the wires with unusually large standard deviations.
 
     Args:
         field: (2, 3UN) displacements and their standard deviations, m.

@@ -107,7 +107,7 @@ class StreamState:
             todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
             frame: Frame that provides σ and the order of the wires.
             a: (U, K) scaled resistances; default: those of the frame.
-            options: Options of the solve; default: those of the stream.
+            options: Options for the solve; default: those of the stream.
             units: Time limit, as in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(

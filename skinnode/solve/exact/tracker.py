@@ -39,13 +39,13 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Upper bound on the time of one solver step, including one evaluation of F and J, seconds.
+"""Upper bound on the time for one solver step, including one evaluation of F and J, seconds.
 
 Each call of the solver processes all wires that are certain to finish before the deadline. Ten calls instead
 of one would cost as much extra time as solving ten more wires.
 """
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Maximum computing time of one wire in one frame, in units of one evaluation of F and J plus one step."""
+"""Maximum computing time for one wire in one frame, in units of one evaluation of F and J plus one step."""
 
 
 class ExactTracker:
@@ -63,7 +63,7 @@ class ExactTracker:
             the forces F.
         hold: Whether to keep the last position of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed it by the time needed for one wire.
+        deadline_us: Time limit for an update, µs; an update can exceed it by the time needed for one wire.
             Wires not processed by the deadline have the status DEADLINE and an infinite standard deviation,
             and are processed first in the next frame.
         normal_only: Whether to fix x and y at rest and solve for z only.
@@ -287,7 +287,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Use the given displacements (U, N, 3), m, as the last solutions of the wires in the mask (U,)."""
+        """Use the displacements (U, N, 3), in metres, as the last solutions of the wires in the mask (U,)."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # solve for all electrodes of these wires again

@@ -83,7 +83,7 @@ def r_solve(a: Float, diagonal: Float, b: Float) -> None:
 
 @njit_part
 def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float) -> None:  # noqa: C901 - loops
-    """Write J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m). ``v`` (m,): work array."""
+    """Write J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m); ``v`` (m,) is a work array."""
     m, n = a.shape
     for j in range(n):
         row = inverse[j]

@@ -11,7 +11,7 @@ from skinnode.solve.operators.work import RADIUS, SINGULAR, Work, times_jacobian
 
 @njit_part
 def dogleg_step(w: Work) -> None:
-    """Set the dogleg step: along −D⁻²g to the Cauchy point, then towards the Newton point up to radius."""
+    """Set the dogleg step: along −D⁻²g to the Cauchy point, then to the Newton point; stop at the radius."""
     n, radius = w.x.size, w.s[RADIUS]
     square = 0.0
     for j in range(n):

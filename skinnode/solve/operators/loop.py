@@ -178,7 +178,7 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """Call :func:`begin` from Python."""
+    """Run :func:`begin`; called from Python."""
     return begin(w)
 
 
@@ -199,5 +199,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """Call :func:`estimate_error` from Python."""
+    """Run :func:`estimate_error`; called from Python."""
     return estimate_error(w, inverse)

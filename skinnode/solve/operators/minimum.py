@@ -6,7 +6,7 @@ D V (Σ² + C) Vᵀ D. This form avoids the product JᵀJ.
 
 The test scales Σ² + C: row k and column k are divided by √(σ_k² + ν), where ν is the rounding error of C. The
 smallest eigenvalue of the scaled matrix is 1 at a minimum with r = 0, about 0 at a flat point, and negative
-at a saddle.
+at a saddle point.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Curvature:
     step: Float
     """(n,) Newton step towards Jᵀr = 0."""
     error: float
-    """Largest error of a coordinate of the minimum due to rounding of r, J and x."""
+    """Largest error in a coordinate of the minimum due to rounding of r, J and x."""
 
     @property
     def positive(self) -> bool:

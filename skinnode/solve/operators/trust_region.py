@@ -80,7 +80,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error of the relative decrease in ‖r‖²."""
+    """Return the rounding error in the relative decrease in ‖r‖²."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):

@@ -52,7 +52,7 @@ class Work(NamedTuple):
     js: Annotated[Float, "m"]
     """J·step."""
     e: Annotated[Float, "m"]
-    """Scratch."""
+    """Work array."""
     jt: Annotated[Float, "n m"]
     """Jᵀ at x."""
     lu: Annotated[Float, "n+3 lanes_n"]

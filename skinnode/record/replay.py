@@ -150,7 +150,7 @@ class Replay:
         self._make_solver = live_solver if solver is None else solver
         self._finished = 0  # number of buses whose last journal events have been applied
         self.strange = 0
-        """Number of frames on channels that belong to no bus of the hand."""
+        """Number of frames on channels that do not belong to any bus of the hand."""
 
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
@@ -218,7 +218,7 @@ class Replay:
             lost = counted(self.dropped, "frame was", "frames were")
             found.append(f"{lost} not recorded: the disk was too slow")
         if self.strange:
-            found.append(f"{counted(self.strange, 'frame')} on channels that belong to no bus of the hand")
+            found.append(f"{counted(self.strange, 'frame')} on channels not used by any bus of the hand")
         return found
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Counts the fields that a program has received and lost, and measures their age."""
+"""Counts the fields that a program has received and lost and measures their age."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class PatchCounts:
     received: int
     """Number of fields received."""
     lost: int
-    """Number of fields that the daemon sent but that did not arrive, as shown by sequence number gaps."""
+    """Number of fields that the daemon sent but that did not arrive, inferred from sequence number gaps."""
     runs: int
     """Number of daemon runs from which fields have arrived."""
     sequence: int

@@ -36,7 +36,7 @@ class Recipients:
     """Functions that receive the decoded data, called in the receiver's thread."""
 
     field: Callable[[FieldFrame, SendStamp, int], None]
-    """Receives a field with times on this machine's monotonic clock, and the message's transit time, ns."""
+    """Receives a field with times on this machine's monotonic clock and the message's transit time, ns."""
     report: Callable[[HealthReport], None]
     event: Callable[[HealthEvent], None]
     on_turn: Callable[[], None]

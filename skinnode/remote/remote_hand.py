@@ -268,7 +268,7 @@ class RemoteHand(Closing):
             self._accounts[name].published = published
 
     def _on_turn(self) -> None:
-        """Publish an event when the daemon disappears or returns, and read a new daemon's description."""
+        """Publish an event when the daemon disappears or returns; read a new daemon's description."""
         if self._watch.arrivals != self._described:
             arrivals = self._watch.arrivals
             description = ask(self._session, self.hand.name)

@@ -43,7 +43,7 @@ class StatusPublication:
 
     Args:
         host: Running host.
-        outputs: Publishers; this thread uses only the publishers that belong to no patch.
+        outputs: Publishers; this thread uses only those that do not belong to a patch.
         started_ns: Time since 1970 that identifies the run of the publication, ns.
         counters: Function that returns the counters of the publication.
         defects: Record of exceptions.

@@ -17,7 +17,7 @@ PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "pydantic", "python-can")
 
 
 def identity() -> dict[str, str]:
-    """Return the versions of skinnode and its packages, and the hash of skinnode's source code.
+    """Return the versions of skinnode and its packages and the hash of skinnode's source code.
 
     Returns:
         Versions and hash by name; ``none`` for a missing package.

@@ -61,7 +61,7 @@ def variants(options: Sequence[str]) -> list[Variant]:
 
 
 def apply(hand: HandConfig, variant: Variant) -> HandConfig:
-    """Return a copy of the hand with the settings of a variant, and without a time limit for solving.
+    """Return a copy of the hand with the settings of a variant and without a time limit for solving.
 
     Raises:
         ConfigError: A patch or a key does not exist, or a value is not allowed.

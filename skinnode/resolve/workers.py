@@ -19,7 +19,7 @@ class Workers(Protocol):
         """Run a unit as soon as a worker is free."""
 
     def finished(self, timeout_s: float) -> Sequence[str]:
-        """Wait for finished units, for at most ``timeout_s`` seconds, and return their keys.
+        """Wait at most ``timeout_s`` seconds for finished units and return their keys.
 
         Raises:
             SkinError: A unit or all workers failed.

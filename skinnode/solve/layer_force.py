@@ -8,11 +8,11 @@ modulus G by
 
     δ = (1/2πG) ∫ p̂(k) f(k t) dk,   f(x) = (sinh 2x − 2x) / (cosh 2x + 1 + 2x²),   p̂(k) = ∫ p e^(ikx) d²x
 
-where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, section 5.8; the thin-layer limit F ∝ G a⁴ δ
-/ t³ is from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ, the ratio of
-the two forces depends only on a/t. The force on a real layer is between that on the half-space and that on
-the bonded layer. On thick layers, the half-space model needs negative loads, which cancel part of the
-positive loads; the sum of the positive loads is therefore a second bound.
+where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, section 5.8; the thin-layer limit
+F ∝ G a⁴ δ / t³ is from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ,
+the ratio of the two forces depends only on a/t. The force on a real layer is between that on the half-space
+and that on the bonded layer. On thick layers, the half-space model needs negative loads, which cancel part of
+the positive loads; the sum of the positive loads is therefore a second bound.
 """
 
 from __future__ import annotations

@@ -179,7 +179,8 @@ def assess_block(
         frames: (4, U, K) resistances, ohm; NaN if invalid.
         noise: (U, K) stated relative standard deviation of the resistances, excluding quantization.
         rounding_ohm: (U, K) standard deviation of the quantization error, ohm; 0 if unknown.
-        quadratic: (U K,) work array. cubic: (U K,) work array.
+        quadratic: (U K,) work array.
+        cubic: (U K,) work array.
 
     Returns:
         The number of changed readings, or 0 if the block is rejected; the variance of the quadratic contrast

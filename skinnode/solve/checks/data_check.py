@@ -1,4 +1,4 @@
-"""Data check: find the readings that contradict the others, and decide whether to trust the field.
+"""Data check: finds the readings that contradict the others and decides whether to trust the field.
 
 Each frame is first solved with all readings except those with a confirmed fault. The check linearises the
 readings about rest and tests them with :mod:`skinnode.solve.checks.reading_model`. If a reading or a whole
@@ -40,12 +40,12 @@ WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
 SUSPICIOUS: Final = 5.0
-"""Gain in log evidence (nats) from assuming a fault above which a frame is suspicious. The check examines
+"""Gain in log evidence from assuming a fault, in nats, above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
 """Values of κ at which single readings are tested, in steps below the best-fitting value."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads (nats) below which loads clearly explain a frame. Similar
+"""Log evidence of faults minus that of loads, in nats, below which loads clearly explain a frame. Similar
 frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
 """Maximum excess (nats) of a frame's gain over that of an examined frame for the two frames to be similar."""
@@ -143,7 +143,7 @@ class DataCheck:
         """Discard the state of the stream, including all faults."""
         self._list.reset()
         self._frame, self._doubtful, self._noisy = 0, False, False
-        self._lead = 0.0  # gain from assuming more noise if the last frame was noisy, nats; else 0
+        self._lead = 0.0  # gain from assuming more noise if the last frame was noisy, nats; otherwise 0
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
@@ -249,7 +249,7 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame is accepted without an examination.
+        """Return whether a frame is accepted without examination.
 
         ``gain`` is the gain in log evidence from assuming a fault, nats. A frame is accepted if the gain is
         small, or if loads clearly explained a recent frame with a similar gain and the same suspected
@@ -383,7 +383,7 @@ class DataCheck:
         return sigma
 
     def _remove_gain(self, present: Mask, std: float) -> None:
-        """Estimate the remaining gain errors with the prior N(0, ``std``²), and subtract them from ``_z``.
+        """Estimate the remaining gain errors with the prior N(0, ``std``²) and subtract them from ``_z``.
 
         The solver underestimates gain errors, because its prior attributes part of each error to a
         displacement of the wire.

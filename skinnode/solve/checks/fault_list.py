@@ -1,4 +1,4 @@
-"""Fault list: the faults of a stream, and the readings left out because of them.
+"""Fault list: the faults of a stream and the readings left out because of them.
 
 A fault is confirmed if it is found in several frames. The readings of a confirmed fault are left out until
 they have agreed with the field for long enough.

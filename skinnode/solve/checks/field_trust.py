@@ -1,4 +1,4 @@
-"""Trust: decide whether a field is trusted, and state the reason if it is not.
+"""Trust: decides whether a field is trusted and states the reason if it is not.
 
 A field is trusted if all upper wires in use converged, enough readings and upper wires are in use, and no
 readings contradict each other. The host also requires the patch to be alive.

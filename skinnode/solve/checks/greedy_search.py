@@ -2,10 +2,10 @@
 
 The search is a form of batch orthogonal matching pursuit. Its dictionary is A = [I B], with one column for
 each of the m readings and one for the readings' response to each of the 4Q loads. The search needs Aᵀ P z and
-the diagonal of the Gram matrix E = Aᵀ P A. Adding a load, or leaving out a reading, is a rank-one update of
-the precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it
-updates Aᵀ P z and the diagonal. Only each wire's block of P' itself is computed; the blocks are needed to
-test whether all readings of a wire are wrong.
+the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a reading is a rank-one update of the
+precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it updates Aᵀ
+P z and the diagonal. Only each wire's block of P' itself is computed; the blocks are needed to test whether
+all readings of a wire are wrong.
 """
 
 from __future__ import annotations

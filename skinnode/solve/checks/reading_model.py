@@ -195,7 +195,7 @@ def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
 def evidences(  # noqa: PLR0913 - a kernel: arrays by name
     vectors_t: Float, shrink: Float, log_det: Float, z: Float, c: Float, out: Float
 ) -> int:
-    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,), and return the index of the maximum.
+    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the maximum.
 
     The constant −½ m ln 2π is omitted. ``c`` (m,) is a work array.
     """

@@ -37,10 +37,10 @@ ENOUGH: Final = 0.5
 """Minimum fraction of usable readings. With fewer, the detector makes no decision."""
 ODD_READING: Final = 6.0
 """Change in a single reading, in standard deviations, above which a frame is solved and its data are checked.
-Noise exceeds this limit in one in 1,700,000 frames of 300 readings."""
+Noise exceeds this limit in 1 of 1,700,000 frames of 300 readings."""
 ODD_WIRE: Final = 8.0
 """Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data are
-checked. Noise exceeds this limit in at most one in 25,000 frames."""
+checked. Noise exceeds this limit in at most 1 of 25,000 frames."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30

@@ -4,7 +4,7 @@ Both options reduce the number of unknowns. The coordinates that are not unknown
 
 ``normal_only`` fixes the x and y coordinates of all electrodes.
 
-``active_only`` fixes the electrodes that no contact moves. At first, all electrodes of a wire are fixed.
+``active_only`` fixes the electrodes not moved by a contact. At first, all electrodes of a wire are fixed.
 While the χ² test rejects the fit, the fixed electrode that explains most of the residual becomes an unknown,
 together with its neighbours. Once more than half of the electrodes would be unknowns, all of them become
 unknowns. When the rest position explains a frame again, all electrodes are fixed again.

@@ -46,7 +46,7 @@ _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE
 def recover_lost(
     stream: StreamState, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
 ) -> None:
-    """Recover the wires without an acceptable root; update ``good`` and ``status`` in its arrays.
+    """Recover the wires without an acceptable root; update ``good`` and ``status`` of the stream.
 
     Args:
         stream: State of the stream.

@@ -35,7 +35,7 @@ reduces an error of 1e-5 to less than 1e-9.
 FRAME_STEPS: Final = 12
 """Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Tasks of each solve: compute the covariance, and reuse the last J⁻¹ where possible."""
+"""Tasks of each solve: compute the covariance and reuse the last J⁻¹ where possible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -129,7 +129,7 @@ class Attempt:
             self.settle(tol_x, left)
 
     def _is_root(self, tol_f: float) -> bool:
-        """Return whether the solve ended at a root; estimate the error of x.
+        """Return whether the solve ended at a root; estimate the error in x.
 
         If the error is too large, CONVERGED becomes ILL_CONDITIONED.
         """

@@ -151,7 +151,7 @@ def settle(
         residual: Function that returns r (m,) for x (n,).
         jacobian: Function that returns J (m, n) for x (n,).
         at: Starting point.
-        tol_x: Largest remaining step, relative to max(1, max|x|).
+        tol_x: Maximum size of the remaining step, relative to max(1, max|x|).
         max_steps: Maximum number of Newton steps.
     """
     before = math.inf

@@ -50,7 +50,7 @@ def operator_code(name: str) -> int:
 
 
 def require_tolerances(tol_f: float, tol_x: float, max_steps: int) -> None:
-    """Raise ValueError if a tolerance is not positive, or ``max_steps`` is not at least 1."""
+    """Raise ValueError if a tolerance is not positive or ``max_steps`` is less than 1."""
     for name, value in (("tol_f", tol_f), ("tol_x", tol_x)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}: got {value}, must be positive and finite")

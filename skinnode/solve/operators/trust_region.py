@@ -123,7 +123,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the actual and predicted decreases in ‖r‖², and update the radius.
+    """Compare the actual and predicted decreases in ‖r‖² and update the radius.
 
     ``norm`` is ‖r‖ at the trial point. Returns ACCEPTED, REJECTED or a Status.
     """

@@ -50,7 +50,7 @@ The starting points are random samples of the posterior; the random seed is fixe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathResult:
-    """Solution at the end of a path, and a log of the solver calls on the path.
+    """Solution at the end of a path and log of the solver calls on the path.
 
     The log consists of ``position``, ``steps``, ``evaluations`` and ``optimality``, with one row per solver
     call. For a wire that a call did not solve, the position and the optimality are NaN. Calls after the first

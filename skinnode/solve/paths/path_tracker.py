@@ -222,7 +222,7 @@ class PathTracker:
         operator: int | None = None,
         also: Callable[[], Mask] | None = None,
     ) -> None:
-        """Solve the last sample for the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
+        """Solve the last sample for the wires in ``todo`` (U,) and store the outcome in :attr:`end`.
 
         Args:
             todo: (U,) mask of the wires to solve.

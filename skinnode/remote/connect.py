@@ -71,7 +71,7 @@ def connect(
 def _described(
     session: zenoh.Session, hand: str, end_s: float | None, options: SessionOptions
 ) -> Description:
-    """Wait for the hand's daemon to appear and to send its description."""
+    """Wait for the hand's daemon to appear and send its description."""
     while True:
         present = bool(tokens(session, hand))
         description = ask(session, hand) if present else None

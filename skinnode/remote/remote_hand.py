@@ -118,7 +118,7 @@ class RemoteHand(Closing):
         """Call ``function`` with each new field, on a separate thread; see :meth:`skinnode.Host.on_field`.
 
         Raises:
-            TypeError: if ``function`` is not callable, or is async.
+            TypeError: if ``function`` is not callable or is async.
             ValueError: if there is no such patch, or ``capacity`` is out of range.
         """
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
@@ -184,8 +184,8 @@ class RemoteHand(Closing):
 
         Raises:
             KeyError: if there is no such patch.
-            NodeError: as the host raises it.
-            SkinError: if the daemon accepts no commands, or does not reply in time.
+            NodeError: if the host raises it.
+            SkinError: if the daemon does not accept commands or does not reply in time.
         """
         default_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
         request: dict[str, object] = {"command": "tare", "patch": patch, "deadline_s": deadline_s}
@@ -196,8 +196,8 @@ class RemoteHand(Closing):
 
         Raises:
             KeyError: if there is no such patch.
-            NodeError: as the host raises it.
-            SkinError: if the daemon accepts no commands, or does not reply in time.
+            NodeError: if the host raises it.
+            SkinError: if the daemon does not accept commands or does not reply in time.
         """
         self._command({"command": "reset_node", "patch": patch}, _RESET_S)
 

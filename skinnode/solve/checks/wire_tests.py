@@ -1,6 +1,6 @@
 """Tests whole wires for gain errors and for readings that are inconsistent with the other wires.
 
-If the readings of a wire are delayed, or belong to another wire, each single reading may agree with the
+If the readings of a wire are delayed or belong to another wire, each individual reading may agree with the
 others within its uncertainty. Only a test of all readings of the wire together then detects the fault. Let G
 be the readings of a wire, P the precision of all readings, S = P⁻¹ their covariance, and α = P z. The tests
 compare two hypotheses with the hypothesis of a healthy wire:

@@ -3,8 +3,8 @@
 The logarithm of each reading contains three gains: those of its upper wire, its lower wire and the patch. The
 patch's gain changes with temperature. Each gain follows a random walk. The filter estimates the gains from
 blocks of untouched frames, so its error is the error after the last block plus the drift since then. Over
-minutes, a steady drift at an unknown rate dominates the random walk, because its variance grows with the
-square of time.
+minutes, a steady drift at an unknown rate dominates the random walk, because the variance of the drift grows
+with the square of time.
 
 A change common to all upper wires looks like a change common to all lower wires, or like a change in the
 patch's gain. The filter therefore uses coordinates v in which every change is visible: the readings change by

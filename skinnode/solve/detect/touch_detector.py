@@ -130,7 +130,7 @@ class TouchDetector:
     def _configure(self) -> None:
         """Create the slow state and the tests for the current noise.
 
-        The ratios between the readings' noise levels stay the same as at the start, so that the tests remain
+        The ratios between the readings' noise levels stay the same as at the start, so the tests remain
         valid.
         """
         sigma = np.hypot(self._factor * self._own, self._rounding)

@@ -293,7 +293,7 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
         ordered: (U,) work array.
 
     Returns:
-        The largest displacement, in standard deviations; the median of the finite ratios; and whether any
+        The largest displacement, in standard deviations; the median of the finite ratios; and True if any
         wire's ratio exceeds :data:`WILD` times the median.
     """
     largest, each, known = 0.0, free.size // ratio.size, 0

@@ -13,7 +13,7 @@ from skinnode.errors import ConfigError, Shown
 from skinnode.record.field_rows import CROSSINGS, FORMAT, NUMBERS, POINTS, PREFIX, TEXTS, WIRES, FieldRow
 
 ROWS_PER_GROUP: Final = 512
-"""Number of rows in a row group, which is held in memory: about 10 MB for patches of 10 × 30 wires."""
+"""Number of rows per row group. A row group is held in memory: about 10 MB for patches of 10 × 30 wires."""
 _KEY: Final = b"skinnode"
 
 
@@ -41,7 +41,7 @@ class ParquetFile:
 
         schema = _schema().with_metadata({_KEY: FORMAT.encode(), b"skinnode.hand": hand.encode()})
         self._schema = schema
-        # a dictionary of measured numbers saves no space, and takes four times as long as everything else
+        # dictionary-encoding measured numbers saves no space and takes four times as long as all else
         texts = ["patch", *TEXTS]
         self._writer = pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
         self._rows: list[dict[str, Any]] = []
@@ -84,7 +84,7 @@ def read_parquet(path: Path) -> tuple[str, Iterator[FieldRow]]:
     """Open a Parquet field table.
 
     Returns:
-        First line of the journal, which contains the hand; and the rows.
+        The journal's first line, which contains the hand, and the rows.
 
     Raises:
         ConfigError: The file is not a Parquet field table, or has a different version.
@@ -104,7 +104,7 @@ def read_parquet(path: Path) -> tuple[str, Iterator[FieldRow]]:
 
 
 def check_format(found: str, path: Path) -> None:
-    """Raise ConfigError unless ``found`` is this version's field-table format."""
+    """Raise ConfigError unless ``found`` is the field-table format of this version."""
     if found == FORMAT:
         return
     if found.startswith(PREFIX):

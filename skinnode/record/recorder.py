@@ -71,7 +71,7 @@ class RecorderStats:
 
 
 def name_in(folder: Path, hand: HandConfig, kind: RecordingFormat, now: datetime.datetime) -> Path:
-    """Return a path in ``folder`` for a recording, consisting of the hand's name, the date and the time."""
+    """Return a path in ``folder`` for a recording, named after the hand, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -168,7 +168,7 @@ class Recorder:
         """Whether the file can contain fields, contacts, health and events."""
         return self._mcap is not None
 
-    # --- methods that the host's threads call
+    # --- methods called by the host's threads
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch of received frames."""
@@ -202,7 +202,7 @@ class Recorder:
     # --- methods for the data that only an MCAP file can contain; see follow()
 
     def field(self, field: FieldFrame) -> None:
-        """Record a field and its contacts. Any thread."""
+        """Record a field and its contacts; callable from any thread."""
         file, log_ns = self._mcap, clock.monotonic_ns() + self._offset_ns
         if file is None or field.stamp is None:
             return
@@ -213,13 +213,13 @@ class Recorder:
         self._fields_lost += not self._put(entry, 0)
 
     def health(self, patches: Mapping[str, PatchHealth], buses: Mapping[str, BusHealth]) -> None:
-        """Record the health of all patches and buses. Any thread."""
+        """Record the health of all patches and buses; callable from any thread."""
         if self._mcap is not None:
             log_ns = clock.monotonic_ns() + self._offset_ns
             self._put(partial(self._mcap.write_health, patches, buses, log_ns), 0)
 
     def event(self, event: HealthEvent) -> None:
-        """Record an event. Any thread."""
+        """Record an event; callable from any thread."""
         if self._mcap is not None:
             log_ns = clock.monotonic_ns() + self._offset_ns
             self._put(partial(self._mcap.write_event, event, self._offset_ns, log_ns), 0)
@@ -249,7 +249,7 @@ class Recorder:
                     self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> bool:
-        """Queue an entry of ``frames`` frames; return True if it was queued or is not needed."""
+        """Queue an entry with ``frames`` frames; return True if it was queued or is not needed."""
         if self._failure is not None or self._queue.qsize() >= CAPACITY:
             self._lost += frames
             return False
@@ -261,7 +261,7 @@ class Recorder:
         bus, t_ns = self._bus_of[patch], clock.monotonic_ns() if t_ns is None else t_ns
         self._put(lambda: self._write_event(bus, t_ns, event, patch=patch, **more), 0)
 
-    # --- methods that the recorder's thread calls
+    # --- methods called by the recorder's thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")

@@ -3,7 +3,7 @@
 The dispatcher, assembler, decoder, stream, solver and publisher are those of the host, but run in a single
 thread: each scan is solved when its last frame is dispatched.
 
-The fields are identical to those of the live run, bit for bit, on these conditions:
+The fields are identical to those of the live run, bit for bit, if these conditions are met:
 
 - the recording is complete and began before the host started;
 - the software and the processor are the same;
@@ -79,9 +79,10 @@ def replay(
     Args:
         path: File ending in .mcap, or in .log, .blf or .asc with its journal in the same folder.
         speed: Replay speed relative to the recording: 2 is twice as fast; None replays as fast as possible.
-        cancelled: Function called before each frame; returning True has the effect of :meth:`Replay.stop`.
-        hand: Hand for a log without a journal, such as a candump log of another master; a journal is then
-            not read. See :func:`skinnode.record.open_recording.open_log`.
+        cancelled: Function called before each frame; returning True has the same effect as
+            :meth:`Replay.stop`.
+        hand: Hand for a log without a journal, such as a candump log of another master; any journal is then
+            ignored. See :func:`skinnode.record.open_recording.open_log`.
 
     Raises:
         ConfigError: The recording cannot be read, or ``speed`` is not positive.
@@ -131,7 +132,7 @@ class Replay:
         name = recording.frames.path.name
         repaired = [f"{name} was repaired; it contains the readable part of a recording"] if repairs else []
         self.notes = (*recording.notes, *repaired)
-        """Messages about a repair, and about assumptions that were made because the log has no journal."""
+        """Messages about a repair, and about assumptions made because the log has no journal."""
         self.incomplete: str | None = None
         """Description of the frames missing from the log; None if none are known to be missing."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
@@ -149,7 +150,7 @@ class Replay:
         self._make_solver = live_solver if solver is None else solver
         self._finished = 0  # number of buses whose last journal events have been applied
         self.strange = 0
-        """Number of frames on channels that belong to no bus of the hand."""
+        """Number of frames on channels that do not belong to any bus of the hand."""
 
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
@@ -217,7 +218,7 @@ class Replay:
             lost = counted(self.dropped, "frame was", "frames were")
             found.append(f"{lost} not recorded: the disk was too slow")
         if self.strange:
-            found.append(f"{counted(self.strange, 'frame')} on channels that belong to no bus of the hand")
+            found.append(f"{counted(self.strange, 'frame')} on channels not used by any bus of the hand")
         return found
 
     def stop(self) -> None:
@@ -246,9 +247,9 @@ class Replay:
 
     @property
     def place(self) -> tuple[int, int]:
-        """Current place in the recording, by which the fields are ordered.
+        """Current position in the recording, by which the fields are ordered.
 
-        The place consists of the number of frames read, and the number of buses whose last journal events
+        The position consists of the number of frames read and the number of buses whose last journal events
         have been applied.
         """
         return self._read, self._finished
@@ -270,7 +271,7 @@ class Replay:
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def layout(self, patch: str) -> PatchLayout:
-        """Return the layout with which a patch's scans are solved. Raises KeyError for an unknown patch."""
+        """Return the layout used to solve a patch's scans. Raises KeyError for an unknown patch."""
         config = self.hand.patch(patch)
         solver = self._buses[config.bus].solver(patch)
         return config.layout.build() if solver is None else solver.facts.layout

@@ -78,7 +78,7 @@ class ReplayedBus:
             self._go_on(frame.can_id)
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
-            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # no fault, because the host commanded it
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # not a fault: the host commanded it
                 monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():
@@ -86,7 +86,7 @@ class ReplayedBus:
         self._dispatcher.measure(frame.t_ns)
 
     def _go_on(self, can_id: int) -> None:
-        """Resume with the same solver after a node restart; no journal records when the host resumed.
+        """Resume with the same solver after a node restart; a log alone does not show when the host resumed.
 
         After a baseline change, scans remain withheld, because the new baseline is unknown.
         """

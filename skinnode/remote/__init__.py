@@ -1,4 +1,4 @@
-"""Publish the fields, health and events of a running host over Zenoh, and use them in other processes.
+"""Publish the fields, health and events of a running host over Zenoh, for use in other processes.
 
 **Data flow**::
 

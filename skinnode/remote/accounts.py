@@ -1,4 +1,4 @@
-"""Counts the fields that a program has received and lost, and measures their age."""
+"""Counts the fields that a program has received and lost and measures their age."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from skinnode.messages.full_field import SendStamp
 
 @dataclass(frozen=True, slots=True)
 class PatchCounts:
-    """Counters of a patch since the program connected."""
+    """Counters for a patch since the program connected."""
 
     received: int
     """Number of fields received."""
     lost: int
-    """Number of fields that the daemon sent but that did not arrive, from gaps in the sequence numbers."""
+    """Number of fields that the daemon sent but that did not arrive, inferred from sequence number gaps."""
     runs: int
     """Number of daemon runs from which fields have arrived."""
     sequence: int
@@ -28,7 +28,7 @@ class PatchCounts:
 
 
 class PatchAccount:
-    """Received and lost fields of a patch. Only the receiver may call :meth:`add`."""
+    """Counts a patch's received and lost fields. Only the receiver may call :meth:`add`."""
 
     def __init__(self) -> None:
         self._received = self._lost = self._runs = self._sequence = 0

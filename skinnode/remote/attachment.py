@@ -17,7 +17,7 @@ class Attachment(NamedTuple):
     """Attachment of a message."""
 
     sequence: int
-    """Sequence number of the message on its topic, from 1."""
+    """Sequence number of the message on its topic, starting at 1."""
     sent_ns: int
     """Time since 1970 at which the message was sent, ns."""
     gid: bytes

@@ -53,7 +53,7 @@ class Claim(Closing):
             if keys.zid_of(token) == zid or HandTopics.base_of(other) != base:
                 continue
             if other == self.hand.name:
-                allowed = "a hand that no other daemon publishes (end the other, or set another name)"
+                allowed = "a hand that no other daemon publishes (end the other daemon, or set another name)"
             else:
-                allowed = f"a name that differs from {other!r}, which is published, in letters or digits"
+                allowed = f"a name that differs from the published hand {other!r} in letters or digits"
             raise ConfigError("name", self.hand.name, allowed, where=self.hand.where("name"))

@@ -1,4 +1,4 @@
-"""Executes commands from programs on a host, one at a time, in a separate thread.
+"""Executes programs' commands on a host, one at a time, in a separate thread.
 
 A request is JSON with ``command`` (``tare`` or ``reset_node``), ``patch`` and, for a tare, ``deadline_s``.
 The reply is empty, or an error as JSON with ``kind``, ``node_id`` and ``text``.
@@ -42,7 +42,7 @@ class CommandServer:
         self._queryable = session.declare_queryable(self._key, self._accept)
 
     def close(self) -> None:
-        """Stop accepting commands, and wait for the command in progress to finish."""
+        """Stop accepting commands and wait for the command in progress to finish."""
         self._queryable.undeclare()
         self._waiting.put(None)
         self._thread.join()

@@ -16,7 +16,7 @@ REPLY_S: Final = 2.0
 
 
 def send(session: zenoh.Session, hand: str, request: dict[str, Any], deadline_s: float) -> None:
-    """Send a command, and wait until it has been executed.
+    """Send a command and wait until it has been executed.
 
     Args:
         session: Session of the program.
@@ -26,7 +26,7 @@ def send(session: zenoh.Session, hand: str, request: dict[str, Any], deadline_s:
 
     Raises:
         NodeError: if the host raises one, for example NodeTimeout.
-        SkinError: if no daemon has accepted the command in time.
+        SkinError: if no daemon accepts the command in time.
     """
     payload = json.dumps(request).encode()
     for reply in session.get(keys.command_key(hand), payload=payload, timeout=deadline_s + REPLY_S):
@@ -35,8 +35,9 @@ def send(session: zenoh.Session, hand: str, request: dict[str, Any], deadline_s:
         if reply.err is not None:
             raise _error(reply.err.payload.to_bytes(), hand)
     raise SkinError(
-        f"hand {hand!r}: no reply to {request['command']} within {deadline_s + REPLY_S:g} s; see whether its "
-        "daemon runs (skinnode host --publish --commands) and access control permits the command"
+        f"hand {hand!r}: no reply to {request['command']} within {deadline_s + REPLY_S:g} s; check "
+        "that its daemon is running (skinnode host --publish --commands) and that access control permits the "
+        "command"
     )
 
 

@@ -71,7 +71,7 @@ def connect(
 def _described(
     session: zenoh.Session, hand: str, end_s: float | None, options: SessionOptions
 ) -> Description:
-    """Wait for the hand's daemon to appear and to send its description."""
+    """Wait for the hand's daemon to appear and send its description."""
     while True:
         present = bool(tokens(session, hand))
         description = ask(session, hand) if present else None
@@ -82,7 +82,7 @@ def _described(
         clock.sleep(_POLL_S)
     if present:
         raise SkinError(
-            f"hand {hand!r}: its daemon is starting and has not described the hand; connect again"
+            f"hand {hand!r}: its daemon is starting and has not described the hand yet; connect again"
         )
     others = published_hands(session)
     if others:

@@ -1,4 +1,4 @@
-"""Tracks whether a daemon publishes a hand, by means of liveliness tokens."""
+"""Uses liveliness tokens to track whether a daemon publishes a hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class DaemonWatch:
-    """Tracker of a hand's daemons. Closing the session ends it. Thread-safe.
+    """Tracks a hand's daemons until the session is closed. Thread-safe.
 
     Args:
         session: Session of the program.

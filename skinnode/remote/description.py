@@ -79,14 +79,16 @@ class Description:
             for name, ours in _VERSIONS.items():
                 if versions[name] != ours:
                     what = f"sends version {versions[name]} of {name}, but this program reads version {ours}"
-                    raise SkinError(f"hand {hand!r}: its daemon {what}; install the same skinnode on both")
+                    raise SkinError(
+                        f"hand {hand!r}: its daemon {what}; install the same version on both sides"
+                    )
             header, _, _ = parse_journal(f"hand {hand!r}", "description", [table["header"].encode()])
             layouts = {name: _layout(each) for name, each in table["layouts"].items()}
             return cls(header.hand, layouts, str(table["boot_id"]), bool(table["commands"]))
         except ConfigError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            why = f"its daemon sent no description ({error!r}); install the same skinnode on both"
+            why = f"its daemon sent no valid description ({error!r}); install the same version on both sides"
             raise SkinError(f"hand {hand!r}: {why}") from None
 
 

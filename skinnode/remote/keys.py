@@ -23,7 +23,7 @@ from skinnode.errors import ConfigError
 from skinnode.messages.typestore import typestore
 
 _NODE: Final = "skinnode"
-"""Name of the ROS 2 node as which the daemon appears."""
+"""Name of the ROS 2 node that represents the daemon."""
 _QOS: Final = "::,:,:,:,,"
 """rmw_zenoh's encoding of its default QoS: reliable, volatile, keep last 42 (``qos.cpp``)."""
 _HIGHEST_DOMAIN: Final = 232
@@ -31,7 +31,7 @@ _HIGHEST_DOMAIN: Final = 232
 
 
 def domain() -> int:
-    """Return the ROS 2 domain, from the environment variable ``ROS_DOMAIN_ID``; 0 by default.
+    """Return the ROS 2 domain given by the environment variable ``ROS_DOMAIN_ID``; 0 by default.
 
     Raises:
         ConfigError: if the variable is not an integer from 0 to 232.

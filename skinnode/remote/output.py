@@ -29,7 +29,7 @@ FIELD_TOPICS: Final = {
 
 
 class Output:
-    """Publisher of a topic, with its liveliness token. Only one thread may call its methods.
+    """Publishes a topic and declares its liveliness token. Only one thread may call the methods.
 
     Args:
         session: Session of the daemon; closing the session closes the publisher.
@@ -56,10 +56,10 @@ class Output:
         return bool(getattr(status, "matching", status))
 
     def send(self, data: bytes, sent_ns: int) -> None:
-        """Publish a message. Never waits.
+        """Publish a message without waiting.
 
         Args:
-            data: The message as CDR.
+            data: CDR-encoded message.
             sent_ns: Time since 1970, ns.
         """
         self._sequence += 1
@@ -68,7 +68,7 @@ class Output:
 
 
 class Outputs:
-    """Publishers of all of a hand's topics, and their ROS 2 node. Closing the session closes them.
+    """Publishers for all topics of a hand, and their ROS 2 node. Closing the session closes them.
 
     Args:
         session: Session of the daemon.

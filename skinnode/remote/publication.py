@@ -84,7 +84,7 @@ class Publication(Closing):
         return PublicationStats(dict(self._published), self._fields.dropped, self._defects.count)
 
     def close(self) -> None:
-        """Stop publishing, and wait for the threads to end."""
+        """Stop publishing and wait for the threads to end."""
         self._over.set()
         self._thread.join()
         self._status.close()
@@ -111,7 +111,7 @@ class Publication(Closing):
         keep_on(self._turn, self._defects, "publishing a field")
 
     def _turn(self) -> bool:
-        """Send the next field. Return False when the host or the publication ends."""
+        """Send the next field. Return False when the host or the publication has ended."""
         if self._over.is_set():
             return False
         try:

@@ -1,4 +1,4 @@
-"""Decodes a daemon's messages in a separate thread, and passes them on."""
+"""Decodes a daemon's messages in a separate thread and passes them on."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class Recipients:
     """Functions that receive the decoded data, called in the receiver's thread."""
 
     field: Callable[[FieldFrame, SendStamp, int], None]
-    """Receives a field with times on this machine's monotonic clock, and the message's transit time, ns."""
+    """Receives a field with times on this machine's monotonic clock and the message's transit time, ns."""
     report: Callable[[HealthReport], None]
     event: Callable[[HealthEvent], None]
     on_turn: Callable[[], None]
-    """Called between two messages."""
+    """Called between messages."""
 
 
 class _Item(NamedTuple):
@@ -84,7 +84,7 @@ class Receiver:
         ]
 
     def close(self) -> None:
-        """Stop receiving, and wait for the thread to end."""
+        """Stop receiving and wait for the thread to end."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._inbox.put(End())

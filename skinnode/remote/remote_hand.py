@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     import zenoh
 
 SILENT_S: Final = 1.0
-"""Time without a health report after which the daemon counts as silent, s. The daemon sends four reports per
-second."""
+"""Time without a health report after which the daemon is considered silent, s. The daemon sends four reports
+per second."""
 _RESET_S: Final = 1.0
 
 
@@ -80,7 +80,7 @@ class RemoteHand(Closing):
         recipients = Recipients(self._on_field, self._on_report, self._events.publish, self._on_turn)
         self._receiver = Receiver(session, description, recipients, self._defects)
 
-    # --- the interface of a host
+    # --- the same interface as a host
 
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
@@ -118,7 +118,7 @@ class RemoteHand(Closing):
         """Call ``function`` with each new field, on a separate thread; see :meth:`skinnode.Host.on_field`.
 
         Raises:
-            TypeError: if ``function`` is not callable, or is async.
+            TypeError: if ``function`` is not callable or is async.
             ValueError: if there is no such patch, or ``capacity`` is out of range.
         """
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
@@ -134,7 +134,7 @@ class RemoteHand(Closing):
         return self._publisher.latest(patch)
 
     def layout(self, patch: str) -> PatchLayout:
-        """Return the electrode layout with which a patch's fields are computed.
+        """Return the electrode layout used to compute a patch's fields.
 
         Raises:
             KeyError: if there is no such patch.
@@ -169,7 +169,7 @@ class RemoteHand(Closing):
         return report.buses[bus] if away is None else replace(report.buses[bus], away=away)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to the events of the host, and to ``away`` and ``back`` of its daemon.
+        """Subscribe to the host's events and to its daemon's ``away`` and ``back`` events.
 
         Args:
             capacity: Queue length, in events. A full queue drops its oldest event.
@@ -184,8 +184,8 @@ class RemoteHand(Closing):
 
         Raises:
             KeyError: if there is no such patch.
-            NodeError: as the host raises it.
-            SkinError: if the daemon accepts no commands, or does not reply in time.
+            NodeError: if the host raises it.
+            SkinError: if the daemon does not accept commands or does not reply in time.
         """
         default_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
         request: dict[str, object] = {"command": "tare", "patch": patch, "deadline_s": deadline_s}
@@ -196,8 +196,8 @@ class RemoteHand(Closing):
 
         Raises:
             KeyError: if there is no such patch.
-            NodeError: as the host raises it.
-            SkinError: if the daemon accepts no commands, or does not reply in time.
+            NodeError: if the host raises it.
+            SkinError: if the daemon does not accept commands or does not reply in time.
         """
         self._command({"command": "reset_node", "patch": patch}, _RESET_S)
 
@@ -205,7 +205,7 @@ class RemoteHand(Closing):
 
     @property
     def away(self) -> str | None:
-        """Reason why no data arrive; None while the daemon is present and sends."""
+        """Reason why no data is arriving; None while the daemon is present and sending."""
         now_ns = clock.monotonic_ns()
         silent_s = (now_ns - self._t_report_ns) * 1e-9
         if not self._watch.present:
@@ -245,7 +245,7 @@ class RemoteHand(Closing):
             raise KeyError(patch)
         name = self.hand.name
         if not self._description.commands:
-            what = "its daemon accepts no commands; start it with skinnode host --publish --commands"
+            what = "its daemon does not accept commands; start it with skinnode host --publish --commands"
             raise SkinError(f"hand {name!r}: {what}")
         if (away := self.away) is not None:
             raise SkinError(away)
@@ -262,17 +262,17 @@ class RemoteHand(Closing):
     def _on_report(self, report: HealthReport) -> None:
         buses = {bus.name for bus in self.hand.buses if self.hand.patches_on(bus.name)}
         if set(report.patches) != set(self._accounts) or set(report.buses) != buses:
-            raise ValueError("a report of the health of another hand")
+            raise ValueError("a health report for another hand")
         self._report, self._t_report_ns = report, clock.monotonic_ns()
         for name, published in report.published.items():
             self._accounts[name].published = published
 
     def _on_turn(self) -> None:
-        """Publish an event when the daemon disappears or returns, and read a new daemon's description."""
+        """Publish an event when the daemon disappears or returns; read a new daemon's description."""
         if self._watch.arrivals != self._described:
             arrivals = self._watch.arrivals
             description = ask(self._session, self.hand.name)
-            if description is not None:  # else the daemon is starting: ask again
+            if description is not None:  # otherwise the daemon is starting: ask again
                 self._described = arrivals
                 self._take(description)
         away = self.away

@@ -36,7 +36,7 @@ _LEASE_MS: Final = 2000
 """Time without messages or keep-alives after which a connection is closed, ms. A suspended process or an
 unplugged cable is detected after this time; a process that ends is detected immediately."""
 _QUEUED: Final = 16
-"""Number of batches (64 KiB each) queued per connection, Zenoh's maximum. Zenoh's default, 2, is too small
+"""Number of batches (64 KiB each) queued per connection; Zenoh's maximum. Zenoh's default, 2, is too small
 for the fields of 16 patches that are solved at the same time."""
 _SETTLE_S: Final = 1.0
 """Time limit for connecting to the other daemons and to the router at startup, s."""
@@ -50,7 +50,7 @@ _ENDPOINT: Final = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[^\]]+\]|[^/:\[\]]+):(\
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """Connections of a daemon or a program.
+    """Connection options of a daemon or a program.
 
     Raises:
         ConfigError: if an endpoint is malformed or a number is out of range.
@@ -83,7 +83,7 @@ class SessionOptions:
 
 
 def host_of(option: str, endpoint: str) -> str:
-    """Return the host in an endpoint.
+    """Return the host part of an endpoint.
 
     Args:
         option: Name of the option, for the error message.
@@ -124,12 +124,12 @@ def require_protected(options: SessionOptions, *, commands: bool) -> None:
         ConfigError: if the daemon accepts commands over a non-local endpoint without TLS.
     """
     if commands and options.exposed is not None:
-        allowed = "only with endpoints of this machine, or tls/… with --zenoh-config"
+        allowed = "only with endpoints on this machine, or tls/… with --zenoh-config"
         raise ConfigError("--commands", Shown(options.exposed), allowed)
 
 
 def open_daemon(options: SessionOptions) -> zenoh.Session:
-    """Open a daemon's session, and wait up to a second for connections to the other daemons.
+    """Open a daemon's session and wait up to a second for connections to the other daemons.
 
     Raises:
         ConfigError: if the configuration is invalid, all ports are in use, or ``options.listen`` cannot be
@@ -154,7 +154,7 @@ def open_daemon(options: SessionOptions) -> zenoh.Session:
         _settle(session, options, port)
         return session
     last = options.port + PORTS - 1
-    raise ConfigError("--port", options.port, f"a free port of {options.port} to {last} (all are {taken})")
+    raise ConfigError("--port", options.port, f"a free port from {options.port} to {last} (all are {taken})")
 
 
 def open_program(options: SessionOptions, end_s: float | None) -> zenoh.Session:
@@ -225,7 +225,7 @@ def _local(port: int) -> str:
 
 
 def _accepts(port: int) -> bool:
-    """Return whether a program listens on a port of this machine."""
+    """Return whether a program is listening on a port of this machine."""
     with socket.socket() as probe:
         return probe.connect_ex((LOCAL, port)) == 0
 
@@ -250,7 +250,7 @@ def _is_local(host: str) -> bool:
 
 
 def _refused(options: SessionOptions, error: Exception) -> ConfigError:
-    """Return the error for endpoints or a configuration that Zenoh has refused."""
+    """Return the error for endpoints or a configuration that Zenoh rejected."""
     listen, router = ("--listen", options.listen), ("--router", options.router)
     option, value = listen if options.listen is not None else router
     if value is None:

@@ -27,7 +27,7 @@ _POLL_S: Final = 0.05
 
 
 class Counters(Protocol):
-    """Counters that a report contains."""
+    """Counters included in a health report."""
 
     @property
     def published(self) -> dict[str, int]:
@@ -43,7 +43,7 @@ class StatusPublication:
 
     Args:
         host: Running host.
-        outputs: Publishers; this thread uses only the publishers that belong to no patch.
+        outputs: Publishers; this thread uses only those that do not belong to a patch.
         started_ns: Time since 1970 that identifies the run of the publication, ns.
         counters: Function that returns the counters of the publication.
         defects: Record of exceptions.
@@ -69,7 +69,7 @@ class StatusPublication:
         self._thread.start()
 
     def close(self) -> None:
-        """Send the pending events, and wait for the thread to end."""
+        """Send the pending events and wait for the thread to end."""
         self._over.set()
         self._thread.join()
 
@@ -89,7 +89,7 @@ class StatusPublication:
         return True
 
     def _report(self) -> None:
-        """Find the topics that have subscribers, and send the health and the poses."""
+        """Find the topics that have subscribers; send the health and the poses."""
         now_ns = clock.time_ns()
         self.wall_minus_mono_ns = now_ns - clock.monotonic_ns()
         outputs, host = self._outputs, self._host

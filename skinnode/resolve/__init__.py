@@ -8,7 +8,7 @@ Data flows in one direction::
 ``plan`` divides the work into units, and ``run`` passes each unit to the workers as soon as the units that it
 needs are finished. There are three kinds of ``units``:
 
-- ``scan_capture`` assembles the scans of some buses from the frames, and checks their codes,
+- ``scan_capture`` assembles the scans of some buses from the frames and checks their codes,
 - ``patch_solver`` solves the scans of one patch with the options of one variant,
 - ``result_file`` writes the fields of all patches to one file, in the order of a replay.
 

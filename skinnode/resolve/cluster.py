@@ -21,7 +21,7 @@ from skinnode.resolve.workers import MOST_DEATHS
 
 _CONNECT_S: Final = 10.0
 _GONE_S: Final = 20.0
-"""Time without a connection to the scheduler after which the cluster counts as lost, s."""
+"""Time without a connection to the scheduler after which the cluster is considered lost, s."""
 
 
 def require_dask() -> None:
@@ -134,7 +134,7 @@ class Cluster(Closing):
     def _gone(self) -> SkinError:
         return SkinError(
             f"--scheduler: the cluster at {self._address} is gone; "
-            "start it and run the same command again, which continues"
+            "start it and run the same command again to continue"
         )
 
     def close(self) -> None:

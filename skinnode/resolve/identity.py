@@ -1,6 +1,7 @@
 """Describes the software of a process. Only processes with the same software compute bit-identical results.
 
-This module imports nothing from skinnode at the top, because the Dask client sends it to workers by value.
+This module imports nothing from skinnode at module level, because the Dask client sends it to workers by
+value.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "pydantic", "python-can")
 
 
 def identity() -> dict[str, str]:
-    """Return the versions of skinnode and its packages, and the hash of skinnode's source code.
+    """Return the versions of skinnode and its packages and the hash of skinnode's source code.
 
     Returns:
         Versions and hash by name; ``none`` for a missing package.

@@ -46,7 +46,7 @@ class PartFiles:
 
     @contextmanager
     def new(self, key: str) -> Iterator[PartWriter]:
-        """Yield a writer for a part, which appears when the block ends without an error.
+        """Yield a writer for a part, whose file appears when the block ends without an error.
 
         Args:
             key: Key of the part.
@@ -85,7 +85,7 @@ class PartFiles:
             return pickle.load(file)[1]
 
     def remove(self, key: str) -> None:
-        """Delete a part, if it exists."""
+        """Delete a part if it exists."""
         discard(self._path(key))
 
     @contextmanager
@@ -133,6 +133,6 @@ def beside(path: Path) -> Path:
 
 
 def put_in_place(temporary: Path, path: Path) -> None:
-    """Rename a complete file to its final name, and flush its folder to disk."""
+    """Rename a complete file to its final name and flush its folder to disk."""
     os.replace(temporary, path)
     flush_folder(path.parent)

@@ -41,7 +41,7 @@ class SolveSummary:
     std_sum_m: float = 0.0
     """Sum over the fields of the median standard deviation of z, m; unknown deviations are left out."""
     cpu_s: float = 0.0
-    """CPU time of solving, s."""
+    """CPU time spent on solving, s."""
     rest_m: tuple[Float, ...] = ()
     """(U, N, 3) electrode positions at rest for each solver, m."""
 

@@ -29,7 +29,7 @@ class Job:
     write: WriteResult
 
     def units(self, parts: PartFiles) -> list[Unit]:
-        """Return the units that are not finished; none if the file is complete."""
+        """Return the unfinished units; none if the file is complete."""
         if self.write.key in parts and self.write.target.exists():
             return []
         parts.remove(self.write.key)
@@ -48,7 +48,7 @@ def make_plan(
     """Return the jobs for all recordings and variants.
 
     Args:
-        recordings: Recordings with their hands.
+        recordings: Recordings and their hands.
         variants: Variants of the options.
         folder: Folder for the results.
         suffix: Suffix of the result files.

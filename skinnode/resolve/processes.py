@@ -1,4 +1,4 @@
-"""Runs units in child processes of this computer.
+"""Runs units in child processes on this computer.
 
 A killed process is replaced, and its unit runs again. The standard ``ProcessPoolExecutor`` would abandon all
 units instead.
@@ -77,7 +77,7 @@ class Processes(Closing):
         return keys
 
     def close(self) -> None:
-        """Kill the processes; the unfinished parts do not appear."""
+        """Kill the processes; no unfinished parts are kept."""
         for child in self._children:
             child.process.kill()
         for child in self._children:
@@ -110,7 +110,7 @@ class Processes(Closing):
         return child
 
     def _bury(self, child: _Child, unit: Unit | None) -> None:
-        """Remove a process that has ended, and queue its unit again."""
+        """Remove a process that has ended and queue its unit again."""
         child.process.join(_END_S)
         status = child.process.exitcode
         child.connection.close()
@@ -127,7 +127,7 @@ class Processes(Closing):
 
 
 def _work(parent: Connection, folder: str, expected: dict[str, str]) -> None:
-    """Run units until the parent process closes its end of the pipe or ends."""
+    """Run units until the parent process exits or closes its end of the pipe."""
     import signal
 
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -143,6 +143,6 @@ def _work(parent: Connection, folder: str, expected: dict[str, str]) -> None:
 
 
 def one_line_of(error: Exception) -> str:
-    """Return the message of one of our exceptions, or the type and message of any other exception."""
+    """Return the message of a skinnode exception, or the type and message of any other exception."""
     text = str(error) if isinstance(error, SkinError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())

@@ -1,4 +1,4 @@
-"""Identifies a recording, and opens it with the hand of a variant."""
+"""Identifies a recording and opens it with the hand of a variant."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from skinnode.record.open_recording import OpenRecording, open_log, open_recordi
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Recording in its state when the command started."""
+    """Recording, and the state of its files when the command started."""
 
     path: Path
     """Absolute path."""
     foreign: bool
-    """Whether it is the log of another master, without a journal."""
+    """Whether this is a log made by another master, without a journal."""
     state: tuple[tuple[int, int], ...]
     """Size (bytes) and modification time (ns) of each of its files."""
 
@@ -27,7 +27,7 @@ class Recording:
         """Open the recording with another hand.
 
         Args:
-            hand: The hand, with the same buses and patches as that of the recording.
+            hand: The hand, with the same buses and patches as the recording's hand.
 
         Raises:
             ConfigError: The recording cannot be read.
@@ -51,7 +51,7 @@ def recording_at(path: Path, hand: HandConfig | None) -> tuple[Recording, HandCo
 
     Args:
         path: The file.
-        hand: Hand for a log without a journal; None for a recording of skinnode.
+        hand: Hand for a log without a journal; None for a recording made by skinnode.
 
     Raises:
         ConfigError: The recording cannot be read.

@@ -48,7 +48,7 @@ def write_result(
         put_in_place(temporary, target)
     except OSError as error:
         discard(temporary)
-        allowed = f"a folder in which files can be written ({error.strerror})"
+        allowed = f"a writable folder ({error.strerror})"
         raise ConfigError("--output", str(target.parent), allowed) from error
     except BaseException:
         discard(temporary)

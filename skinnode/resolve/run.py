@@ -1,4 +1,4 @@
-"""Runs the jobs of a plan, and continues where an earlier run stopped."""
+"""Runs the jobs of a plan and continues where an earlier run stopped."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def work_folder(output: Path) -> Iterator[Path]:
     """Create and lock the work folder in ``output``; delete it when the block ends without an error.
 
     Args:
-        output: Folder of the results, created if needed.
+        output: Folder for the results, created if needed.
 
     Raises:
         ConfigError: The folder cannot be created, or another command is using it.
@@ -37,7 +37,7 @@ def work_folder(output: Path) -> Iterator[Path]:
         allowed = f"a folder that no other skinnode resolve is using ({error})"
         raise ConfigError("--output", str(output), allowed) from None
     except OSError as error:
-        allowed = f"a folder in which files can be written ({error.strerror})"
+        allowed = f"a writable folder ({error.strerror})"
         raise ConfigError("--output", str(output), allowed) from None
     try:
         yield folder

@@ -1,4 +1,4 @@
-"""Assembles the scans of a recording with the host's code, and stores them for solving later."""
+"""Assembles the scans of a recording with the host's code and stores them for solving later."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from skinnode.record.replay import Replay
 from skinnode.resolve.recording import Recording
 
 Place = tuple[int, int, int]
-"""Place of a field in a replay: :attr:`Replay.place`, and the number of the scan in its capture."""
+"""Position of a field in a replay: :attr:`Replay.place`, and the number of the scan in its capture."""
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedFacts:
-    """Facts with which a new solver solves the following scans of a patch.
+    """Facts from which a new solver is made for the following scans of a patch.
 
     The facts are stored as in a journal. When the facts are rebuilt, patches with the same layout share the
     layout's tables.
@@ -44,7 +44,7 @@ class CapturedScan:
 
     place: Place
     now_ns: int
-    """Time of the replay at which the scan is solved, on the host's monotonic clock, ns."""
+    """Replay time at which the scan is solved, on the host's monotonic clock, ns."""
     scan: Scan
     stamp: ScanStamp
     verdict: Verdict
@@ -62,7 +62,7 @@ class CaptureSummary:
     flaws: tuple[str, ...]
     """Messages about missing or unreadable parts of the recording."""
     notes: tuple[str, ...]
-    """Assumptions that were made because there is no journal."""
+    """Assumptions made because there is no journal."""
     losses: tuple[str, ...]
     """Messages about lost frames and scans."""
 
@@ -121,7 +121,7 @@ class Capture:
 
 
 class _CapturingSolver(ScanSolver):
-    """Replaces a solver: passes scans on, and returns empty fields."""
+    """Stands in for a solver: passes scans on and returns empty fields."""
 
     def __init__(self, facts: NodeFacts, keep: Callable[[Scan, ScanStamp, Verdict], None]) -> None:
         self.facts = facts  # the tracker of ScanSolver is not needed

@@ -1,4 +1,4 @@
-"""Parses ``--set`` options, and applies them to the hand of a recording."""
+"""Parses ``--set`` options and applies them to the hand of a recording."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skinnode.config import HandConfig, PatchConfig, SolverConfig, parse_hand
 from skinnode.errors import ConfigError
 
 _PATCH_KEYS: Final = ("relative_noise", "calibration", "tolerances", "layout")
-"""Keys of a patch that describe its skin rather than its identity on the bus."""
+"""Patch keys that describe the skin rather than the patch's identity on the bus."""
 _EVERY_PATCH: Final = "*"
 _ALLOWED: Final = (
     "solver.KEY, or patches.NAME.KEY, where NAME is a patch or * for all, "
@@ -20,7 +20,7 @@ _ALLOWED: Final = (
 )
 _WITHOUT_LIMIT: Final = "no time limit, because the results would depend on the speed of the computer"
 _LIVE: Final = {"deadline_us": _WITHOUT_LIMIT, "workers": "--processes instead"}
-"""Keys of the solver that only a live host uses."""
+"""Solver keys used only by a live host."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +41,8 @@ def variants(options: Sequence[str]) -> list[Variant]:
     """Return all combinations of option values.
 
     Args:
-        options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. A value is a TOML value; a value that is not
-            TOML is a string.
+        options: Texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE,…``. Values are parsed as TOML; a value that is not
+            valid TOML is a string.
 
     Raises:
         ConfigError: An option has no key or no value, has a key that cannot be set, or occurs twice.
@@ -55,13 +55,13 @@ def variants(options: Sequence[str]) -> list[Variant]:
             raise ConfigError("--set", option, "KEY=VALUE, or KEY=VALUE,VALUE,… for a sweep")
         _check(key)
         if key in found:
-            raise ConfigError("--set", option, f"{key} only once; separate several values by commas")
+            raise ConfigError("--set", option, f"{key} only once; separate multiple values with commas")
         found[key] = [Setting(key, _value(part), part) for part in _split(text)]
     return list(itertools.product(*found.values()))
 
 
 def apply(hand: HandConfig, variant: Variant) -> HandConfig:
-    """Return a copy of the hand with the settings of a variant, and without a time limit for solving.
+    """Return a copy of the hand with the settings of a variant and without a time limit for solving.
 
     Raises:
         ConfigError: A patch or a key does not exist, or a value is not allowed.
@@ -104,7 +104,7 @@ def _patch_and_key(key: str) -> tuple[str, list[str]]:
 
 
 def _paths(hand: HandConfig, setting: Setting) -> list[list[str | int]]:
-    """Return the paths in the table of a hand that a setting changes."""
+    """Return the paths in a hand's table that a setting changes."""
     if setting.key.startswith("solver."):
         return [list(setting.key.split("."))]
     name, keys = _patch_and_key(setting.key)
@@ -121,7 +121,7 @@ def _set(table: Any, path: list[str | int], setting: Setting) -> None:
             continue
         table = table.setdefault(part, {})
         if not isinstance(table, dict | list | tuple):
-            raise ConfigError("--set", setting.key, f"{part} itself, which is no table here")
+            raise ConfigError("--set", setting.key, f"{part} itself, which is not a table here")
     table[path[-1]] = setting.value
 
 
@@ -133,7 +133,7 @@ def _value(text: str) -> Any:
 
 
 def _split(text: str) -> list[str]:
-    """Split a text at the commas outside brackets and quotes."""
+    """Split a string at the commas outside brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for character in text:
         if quote:

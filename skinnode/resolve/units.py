@@ -21,7 +21,7 @@ from skinnode.resolve.scan_capture import Capture, CaptureSummary
 
 @dataclass(frozen=True)
 class Unit:
-    """Work whose result is one part file.
+    """Piece of work that results in one part file.
 
     Attributes:
         recording: The recording.
@@ -61,7 +61,9 @@ class Unit:
 
 @dataclass(frozen=True)
 class CaptureScans(Unit):
-    """Unit that assembles the scans of some buses. Its part has the summary; each patch has its own part.
+    """Unit that assembles the scans of some buses.
+
+    Its part contains the summary; the scans of each patch have a part of their own.
 
     Attributes:
         buses: Names of the buses.
@@ -137,7 +139,7 @@ class ResultSummary:
     faults: tuple[str, ...]
     """Messages about missing or unreadable parts of the recording, and about lost frames and scans."""
     notes: tuple[str, ...]
-    """Assumptions that were made because there is no journal."""
+    """Assumptions made because there is no journal."""
 
 
 @dataclass(frozen=True)

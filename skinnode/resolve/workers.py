@@ -19,15 +19,15 @@ class Workers(Protocol):
         """Run a unit as soon as a worker is free."""
 
     def finished(self, timeout_s: float) -> Sequence[str]:
-        """Wait for finished units, for at most ``timeout_s`` seconds, and return their keys.
+        """Wait at most ``timeout_s`` seconds for finished units and return their keys.
 
         Raises:
             SkinError: A unit or all workers failed.
         """
 
     def close(self) -> None:
-        """End the running units and the workers."""
+        """Stop the running units and the workers."""
 
 
 MOST_DEATHS = 3
-"""Number of worker deaths while running the same unit after which the unit fails."""
+"""Number of workers lost while running the same unit after which the unit fails."""

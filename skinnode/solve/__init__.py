@@ -1,7 +1,7 @@
 """Solvers that compute displacements from resistances; independent of buses and threads.
 
 ``tracker`` solves a live stream with one of two methods: ``exact`` inverts each wire separately, and
-``posterior`` estimates the whole patch. ``detect`` decides before a frame is solved whether the patch is
+``posterior`` estimates the whole patch. ``detect`` decides, before a frame is solved, whether the patch is
 touched. ``root_gate`` checks doubtful roots of the exact inverse with the posterior; ``roots`` contains the
 criteria. ``checks`` finds readings that contradict the others, and decides
 whether a field is trusted. ``noise_estimate`` corrects the stated noise if the stream contradicts it.

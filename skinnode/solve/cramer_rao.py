@@ -28,7 +28,7 @@ def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool =
 
     Args:
         layout: The patch.
-        relative_noise: Relative standard deviation of R, a number or (U, K).
+        relative_noise: Relative standard deviation of R, scalar or (U, K).
         normal_only: Whether to solve for z only.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Validation of a tracker's arguments. Wrong shapes raise an exception; invalid resistances do not."""
+"""Validates a tracker's arguments. Wrong shapes raise an exception; invalid resistances do not."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""Relative noise above which a resistance is unusable; its square does not overflow."""
+"""Relative noise above which a resistance is unusable. The square of this value does not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeMap:
-    """Mapping of a converter's codes 0 to ``steps`` to resistances: R = (lo + code · step) · R0 · gain."""
+    """Mapping from a converter's codes 0 to ``steps`` to resistances: R = (lo + code · step) · R0 · gain."""
 
     baseline_ohm: Float
     """(U, K) baselines R0, ohm; the codes of a crossing are invalid if its R0 is not positive and finite."""
@@ -41,7 +41,7 @@ class CodeMap:
         object.__setattr__(self, "unknown", unknown if unknown.any() else None)
 
     def decode(self, codes: NDArray[np.uint32]) -> tuple[Float, NDArray[np.bool_]]:
-        """Return the resistances (U, K), ohm, and a mask (U, K) of the valid codes.
+        """Return the resistances (U, K) in ohms and a mask (U, K) of the valid codes.
 
         The resistance of an invalid code is NaN.
         """
@@ -57,10 +57,10 @@ class CodeMap:
 
 
 class CodeDecoder:
-    """Decoder of the codes of a stream. Codes that have not changed are not decoded again.
+    """Decoder for the codes of a stream. Codes that have not changed are not decoded again.
 
     Args:
-        meaning: Mapping of the codes to resistances.
+        meaning: Mapping from the codes to resistances.
     """
 
     def __init__(self, meaning: CodeMap) -> None:
@@ -73,10 +73,10 @@ class CodeDecoder:
 
         Args:
             codes: (U, K) codes. If a host passes the read-only array of the last frame again, because the
-                node has sent no other codes, the result is that of the last call.
+                node has sent no new codes, the result is that of the last call.
 
         Returns:
-            Read-only resistances (U, K), ohm, NaN where a code is invalid; a read-only mask (U, K) of the
+            Read-only resistances (U, K) in ohms, NaN where a code is invalid; a read-only mask (U, K) of the
             valid codes; and the number of invalid codes.
         """
         if codes is self._codes:

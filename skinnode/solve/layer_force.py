@@ -8,11 +8,11 @@ modulus G by
 
     δ = (1/2πG) ∫ p̂(k) f(k t) dk,   f(x) = (sinh 2x − 2x) / (cosh 2x + 1 + 2x²),   p̂(k) = ∫ p e^(ikx) d²x
 
-where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
-from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ, the ratio of the two
-forces depends only on a/t. The force on a real layer is between that on the half-space and that on the bonded
-layer. On thick layers, the half-space model needs negative loads, which cancel part of the positive loads;
-the sum of the positive loads is therefore a second bound.
+where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, section 5.8; the thin-layer limit
+F ∝ G a⁴ δ / t³ is from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ,
+the ratio of the two forces depends only on a/t. The force on a real layer is between that on the half-space
+and that on the bonded layer. On thick layers, the half-space model needs negative loads, which cancel part of
+the positive loads; the sum of the positive loads is therefore a second bound.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from skinnode.model.elastic import Rubber
 LINEAR: Final = 1.05
 """Coefficient of a/t in the ratio of the force on a bonded layer to that on a half-space.
 
-LINEAR and CUBIC were fitted to the exact integral for a/t from 0.05 to 20. The error of the ratio is at most
+LINEAR and CUBIC were fitted to the exact integral for a/t from 0.05 to 20. The error in the ratio is at most
 12 %.
 """
 CUBIC: Final = 0.51
@@ -49,7 +49,7 @@ def stiffening(radius_m: float, thickness_m: float) -> float:
 
 
 def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m: float) -> float:
-    """Return the force in N that indents a bonded layer by ``depth_m`` in a circular contact.
+    """Return the force, N, that indents a bonded layer by ``depth_m`` in a circular contact.
 
     Args:
         rubber: The material.

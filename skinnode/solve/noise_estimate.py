@@ -1,4 +1,4 @@
-"""Estimate of the noise factor: the ratio of a stream's actual noise to its stated noise.
+"""Estimates the noise factor, the ratio of a stream's actual noise to its stated noise.
 
 The estimator uses only the readings, in blocks of four frames. The four resistances of a crossing yield two
 contrasts, in which a constant and a linear trend cancel. If the noise is independent from frame to frame, the
@@ -10,7 +10,7 @@ cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 A block is rejected if the skin moved. Two tests detect motion:
 
 - Slow motion, a step or a lost scan makes the variances of the two contrasts unequal. Slow motion makes the
-  quadratic contrast the larger one.
+  quadratic contrast larger than the cubic.
 - Motion gives the contrasts of neighbouring crossings the same sign, whereas noise gives them independent
   signs.
 
@@ -18,10 +18,10 @@ The variance of a block is a robust mean over its readings (Huber, Robust Statis
 limits the influence of bad readings and of a touch on a few wires. The estimate is the median over the last
 blocks, which limits the influence of a single block.
 
-Readings that repeat exactly are left out, because they do not tell a quiet converter from a frozen one. If
-many codes repeat and the others change by only one code, the noise is at most half a code, and the estimator
-assumes half a code. If the quantization error is known, the factor applies only to the noise before the
-converter.
+Readings that repeat exactly are left out, because they cannot distinguish a quiet converter from a frozen
+one. If many codes repeat and the others change by only one code, the noise is at most half a code, and the
+estimator assumes half a code. If the quantization error is known, the factor applies only to the noise before
+the converter.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ PAUSE: Final = 12
 """Number of frames skipped once a full window agrees with its last block.
 
 This is also the maximum number of frames skipped after rejected blocks. Without skipping, the noise estimate
-would take 8 % of the computing time of a patch at rest.
+would take 8 % of the computing time for a patch at rest.
 """
 REPEATED: Final = 0.15
 """Fraction of exactly repeated readings above which the contrasts of a block do not measure the noise.
@@ -57,7 +57,7 @@ With a noise of half a code, a tenth of the readings are equal in all four frame
 variance of the codes is no longer the sum of the noise variance and the quantization variance.
 """
 ALIVE: Final = 4
-"""Minimum number of changed readings for a block in which many readings repeat; with fewer, the block is
+"""Minimum number of changed readings in a block where many readings repeat; with fewer, the block is
 rejected."""
 SAME: Final = 1e-14
 """Maximum contrast of a repeated reading, relative to the reading. The tolerance covers float64 rounding."""
@@ -74,7 +74,7 @@ STEP: Final = math.log(1.05)
 """Minimum change in the logarithm of the noise factor, in addition to the margin, for the factor to be
 updated. Each update requires another solve of the frame."""
 UNEQUAL: Final = 0.3
-"""Maximum mean logarithm of the ratio between the variances of the quadratic and the cubic contrast.
+"""Maximum mean logarithm of the ratio between the variances of the quadratic and cubic contrasts.
 
 At this limit, motion of the skin raises the noise estimate by 8 %.
 """
@@ -97,7 +97,7 @@ _ITERATIONS: Final = 30
 _ONE_CODE: Final = 12.5
 """Maximum squared contrast of a reading that changes by one code, in units of the quantization variance."""
 _HALF_A_CODE: Final = 4.0
-"""Variance of the quantization error and a noise of half a code together, in units of the quantization
+"""Combined variance of the quantization error and a noise of half a code, in units of the quantization
 variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
@@ -179,8 +179,8 @@ def assess_block(
         frames: (4, U, K) resistances, ohm; NaN if invalid.
         noise: (U, K) stated relative standard deviation of the resistances, excluding quantization.
         rounding_ohm: (U, K) standard deviation of the quantization error, ohm; 0 if unknown.
-        quadratic: (U K,) workspace.
-        cubic: (U K,) workspace.
+        quadratic: (U K,) work array.
+        cubic: (U K,) work array.
 
     Returns:
         The number of changed readings, or 0 if the block is rejected; the variance of the quadratic contrast

@@ -27,8 +27,8 @@ class EstimateOptions:
     """Options common to all trackers.
 
     Args:
-        relative_noise: Relative standard deviation of R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors of resistivity and gain
+        relative_noise: Relative standard deviation of R, scalar or (U, K).
+        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors in resistivity and gain
             cancel.
         rubber: Material of the skin. Forces are proportional to its modulus; displacements do not depend on
             the modulus.
@@ -46,14 +46,15 @@ class EstimateOptions:
         tolerances: Manufacturing tolerances of the patch, which increase the standard deviations; None
             (default) for an exact patch. The resistances at rest must have been measured on the patch itself.
         contacts: Whether to estimate contacts and forces.
-        force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for example presses with
-            a load cell. A modulus from a data sheet is not a calibration: forces are computed for a
+        force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for example in presses
+            with a load cell. A modulus from a data sheet is not a calibration: forces are computed for a
             half-space, and a thin layer on a support can carry fifty times as much force at the same
             displacement. If False, the standard deviation of each normal force covers this difference.
-        normal_only: Whether to fix x and y at rest and solve for z only, with a third of the unknowns.
+        normal_only: Whether to fix x and y at rest and solve for z only, which leaves a third of the
+            unknowns.
         hold: Whether to keep the last solution of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed it by the time of one solver step.
+        deadline_us: Time limit for an update, µs; an update can exceed it by the duration of one solver step.
             Wires that are unsolved at the deadline have the status DEADLINE.
         prior: Prior of the loads after the posterior has found a touch: ``cells`` for one variance per cell,
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
@@ -101,7 +102,7 @@ class EstimateOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: ``scale_m``, and those of :class:`EstimateOptions`.
+    """Options of :class:`skinnode.Posterior`: ``scale_m`` and those of :class:`EstimateOptions`.
 
     Args:
         scale_m: RMS normal displacement in the prior, metres; by default, it is estimated from the data.
@@ -119,7 +120,7 @@ class PosteriorOptions(EstimateOptions):
 
     @property
     def kernels(self) -> tuple[object, ...]:
-        """Values of all options that decide which kernels a stream calls."""
+        """Values of all options that determine which kernels a stream calls."""
         numbers = "relative_noise", "baseline_ohm", "rubber", "deadline_us"
         names = [field.name for field in dataclasses.fields(self) if field.name not in numbers]
         return tuple(getattr(self, name) for name in names)
@@ -127,7 +128,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: the following, and those of :class:`EstimateOptions`.
+    """Options of :class:`skinnode.Tracker`: the following and those of :class:`EstimateOptions`.
 
     Only the posterior supports ``drift``, ``model_error``, ``tolerances`` and ``estimate_noise``. If any of
     them is set, ``auto`` selects the posterior.
@@ -139,7 +140,7 @@ class TrackerOptions(EstimateOptions):
             computes ``force_n`` by this law. All other forces, including contact forces, are computed from
             ``rubber``.
         active_only: Whether to fix electrodes at rest unless a contact moves them; exact inverse only.
-        codes: Mapping of the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
+        codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
         max_std_m: Maximum standard deviation of a coordinate in a precise field, metres. The default depends
             on the layout and the noise (:mod:`skinnode.solve.precision`).
         max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N. The

@@ -62,7 +62,7 @@ def test_only_the_operator_commands_and_only_with_a_certificate(
 def test_commands_leave_the_machine_only_by_tls(options: dict[str, str], refused: bool) -> None:
     if refused:
         with pytest.raises(
-            ConfigError, match=r"--commands: got .*, allowed: only with endpoints of this machine"
+            ConfigError, match=r"--commands: got .*, allowed: only with endpoints on this machine"
         ):
             require_protected(SessionOptions(**options), commands=True)
     else:

@@ -120,7 +120,7 @@ def test_ports_in_use_are_one_line(hand_file: Path, port: int, capsys: pytest.Ca
     for each in taken:
         each.close()
     assert (status, text.count("\n")) == (2, 1)
-    assert f"--port: got {port}, allowed: a free port of {port} to {port + 15}" in text
+    assert f"--port: got {port}, allowed: a free port from {port} to {port + 15}" in text
     with socket.create_server(("127.0.0.1", port)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         free = [str(hand_file), "--publish", "--port", str(port), "--listen", endpoint]

@@ -1,4 +1,4 @@
-"""Check frames for contradictory readings, and decide which fields to trust.
+"""Check frames for contradictory readings and decide which fields to trust.
 
 ``data_check`` checks each field of a tracker. The checks use ``reading_model``, the joint distribution of a
 layout's readings linearised at rest. ``explanations`` finds the most likely explanation of a frame: either

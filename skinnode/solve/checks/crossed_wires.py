@@ -7,7 +7,7 @@ readings, P is their precision, α = P z, and δ is the change in z. No paramete
 increase of a few nats is significant.
 
 In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), no exchange increased
-the log evidence by more than 2.8 nats. If two wires were in fact crossed, exchanging them increased the log
+the log evidence by more than 2.8 nats. If two wires were actually crossed, exchanging them increased the log
 evidence by a median of 125 nats for upper wires and 43 nats for lower wires.
 """
 

@@ -1,4 +1,4 @@
-"""Data check: find the readings that contradict the others, and decide whether to trust the field.
+"""Data check: finds the readings that contradict the others and decides whether to trust the field.
 
 Each frame is first solved with all readings except those with a confirmed fault. The check linearises the
 readings about rest and tests them with :mod:`skinnode.solve.checks.reading_model`. If a reading or a whole
@@ -34,28 +34,27 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Limit on the groups of readings left out of a frame. Once the limit is reached, the frame is not solved
-again."""
+"""Maximum number of groups of readings left out of a frame. Once the limit is reached, the frame is not
+solved again."""
 WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
 SUSPICIOUS: Final = 5.0
-"""Gain in log evidence (nats) from assuming a fault, above which a frame is suspicious. The check examines
+"""Gain in log evidence from assuming a fault, in nats, above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Steps in κ below the best-fitting value at which single readings are tested."""
+"""Values of κ at which single readings are tested, in steps below the best-fitting value."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Similar
+"""Log evidence of faults minus that of loads, in nats, below which loads clearly explain a frame. Similar
 frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
-"""Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
-to count as similar."""
+"""Maximum excess (nats) of a frame's gain over that of an examined frame for the two frames to be similar."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames for which the result of an examination also applies to similar frames. Each examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""One in this many suspicious frames is examined even if the deadline leaves no time. A fault makes every
-subsequent frame suspicious; a press rarely does."""
+"""Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
+makes every subsequent frame suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Assumed duration of the first examination, s. Later examinations are timed."""
 CROSSED_FRAMES: Final = 5
@@ -81,7 +80,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A field, and the readings from which it was computed."""
+    """A field and the readings from which it was computed."""
 
     field: FieldFrame
     a: Float
@@ -93,7 +92,7 @@ class Solved:
 
 
 class DataCheck:
-    """Data check of one patch, frame by frame. Each stream needs its own instance.
+    """Checks the readings of one patch frame by frame. Each stream needs its own instance.
 
     Args:
         problem: The patch.
@@ -144,7 +143,7 @@ class DataCheck:
         """Discard the state of the stream, including all faults."""
         self._list.reset()
         self._frame, self._doubtful, self._noisy = 0, False, False
-        self._lead = 0.0  # gain from assuming more noise if the last frame was noisy, nats; else 0
+        self._lead = 0.0  # gain from assuming more noise if the last frame was noisy, nats; otherwise 0
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
@@ -160,13 +159,13 @@ class DataCheck:
         return self._list.mask
 
     def pass_frame(self) -> None:
-        """Count a frame that is not checked, because the patch is untouched."""
+        """Count a frame that is not checked because the patch is untouched."""
         self._frame += 1
 
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Check the readings of a frame, and return its field with the faults found and the trust decision.
+        """Check the readings of a frame; return its field with the faults found and the trust decision.
 
         If readings are found to be wrong, the returned field is that of a new solve without them.
 
@@ -177,7 +176,7 @@ class DataCheck:
             until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A suspicious frame
                 that cannot be examined in time is not trusted; every :data:`PATIENCE`-th such frame is
                 examined regardless. Pass −inf if the solver ran out of time: wires without a solution are
-                then not taken for faulty.
+                then not considered faulty.
         """
         self._frame += 1
         last = self._last
@@ -250,7 +249,7 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame is accepted without an examination.
+        """Return whether a frame is accepted without examination.
 
         ``gain`` is the gain in log evidence from assuming a fault, nats. A frame is accepted if the gain is
         small, or if loads clearly explained a recent frame with a similar gain and the same suspected
@@ -310,7 +309,7 @@ class DataCheck:
         return found
 
     def _may_examine(self, gain: float, until: float) -> bool:
-        """Return whether a suspicious frame may be examined in view of the deadline.
+        """Return whether to examine a suspicious frame, given the deadline.
 
         If there is no time, the frame is marked as unexamined. It is not marked if a similar frame was
         examined recently and found to be free of faults.
@@ -339,7 +338,7 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame if its noise is above the stated level.
+        """Return the log evidence of the frame, assuming that its noise is above the stated level.
 
         If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
         ln(ratio) for each reading.
@@ -365,7 +364,7 @@ class DataCheck:
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:
-        """Write the linearised changes, in units of the noise, into ``_z``, and return the relative noise."""
+        """Write the linearised changes, in units of the noise, into ``_z``; return the relative noise."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
@@ -384,7 +383,7 @@ class DataCheck:
         return sigma
 
     def _remove_gain(self, present: Mask, std: float) -> None:
-        """Estimate the remaining gain errors with the prior N(0, ``std``²), and subtract them from ``_z``.
+        """Estimate the remaining gain errors with the prior N(0, ``std``²) and subtract them from ``_z``.
 
         The solver underestimates gain errors, because its prior attributes part of each error to a
         displacement of the wire.
@@ -463,7 +462,7 @@ class DataCheck:
         return groups if len(groups) <= COARSE_GROUPS else groups[:1]
 
     def _follow(self, solved: Solved) -> None:
-        """Compare the readings that have a confirmed fault with the field, and update the fault list."""
+        """Compare the readings that have a confirmed fault with the field and update the fault list."""
         self._list.follow(*self._deviations(solved))
 
     def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
@@ -508,6 +507,6 @@ def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
 
 
 def _still(solved: Solved, last: FieldFrame) -> bool:
-    """Return whether all wires were held, and no status has changed since the last field."""
+    """Return whether all wires were held and no status has changed since the last field."""
     held = solved.field.held
     return held is not None and bool(held.all()) and solved.field.status == last.status

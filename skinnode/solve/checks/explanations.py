@@ -43,7 +43,7 @@ can inflate the best-fitting scale by a factor of up to 2⁴, a narrow contact b
 STRIDE: Final = 2
 """Step in log2 κ between the prior scales that are searched."""
 HOPELESS: Final = 150.0
-"""Log evidence of loads minus that of faults at one prior scale, nats, above which smaller scales are not
+"""Log evidence of loads minus that of faults at one prior scale, in nats, above which smaller scales are not
 searched for faults. In 163 frames with a fault, the difference was at most 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}

@@ -1,4 +1,4 @@
-"""Fault list: the faults of a stream, and the readings left out because of them.
+"""Fault list: the faults of a stream and the readings left out because of them.
 
 A fault is confirmed if it is found in several frames. The readings of a confirmed fault are left out until
 they have agreed with the field for long enough.
@@ -19,8 +19,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, out of the last :data:`WITHIN`, in which a fault must be found to be confirmed. Not
-tuned."""
+"""Number of frames, out of the last :data:`WITHIN`, in which a fault must be found before it is confirmed.
+Not tuned."""
 WITHIN: Final = 10
 """Number of successive frames in which the detections of a fault are counted."""
 ADMIT: Final = 64
@@ -78,7 +78,7 @@ class FaultList:
         return found
 
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
-        """Record the groups of wrong readings of a frame, and return the faults that are not yet confirmed.
+        """Record the groups of wrong readings in a frame and return the faults that are not yet confirmed.
 
         Args:
             groups: Groups of wrong readings.

@@ -1,4 +1,4 @@
-"""Trust: decide whether a field is trusted, and state the reason if it is not.
+"""Trust: decides whether a field is trusted and states the reason if it is not.
 
 A field is trusted if all upper wires in use converged, enough readings and upper wires are in use, and no
 readings contradict each other. The host also requires the patch to be alive.
@@ -21,7 +21,7 @@ OF_PATCH: Final = 0.75
 field of the reference patch is trusted if two upper wires and one lower wire are missing (77 % of the
 readings remain), but not if three upper wires are missing (70 %)."""
 OF_WIRE: Final = 0.8
-"""Minimum fraction of usable readings of a trusted wire."""
+"""Minimum fraction of usable readings for a trusted wire."""
 CONTRADICTION: Final = (
     "the readings contradict each other, and no faulty wire or crossing explains the contradiction"
 )

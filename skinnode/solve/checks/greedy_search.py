@@ -2,10 +2,10 @@
 
 The search is a form of batch orthogonal matching pursuit. Its dictionary is A = [I B], with one column for
 each of the m readings and one for the readings' response to each of the 4Q loads. The search needs Aᵀ P z and
-the diagonal of the Gram matrix E = Aᵀ P A. Adding a load, or leaving out a reading, is a rank-one update of
-the precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it
-updates Aᵀ P z and the diagonal. Of P' itself, only the block of each wire is computed; the blocks are needed
-to test whether all readings of a wire are wrong.
+the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a reading is a rank-one update of the
+precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it updates Aᵀ
+P z and the diagonal. Only each wire's block of P' itself is computed; the blocks are needed to test whether
+all readings of a wire are wrong.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ Mask = NDArray[np.bool_]
 class GreedySearch:
     """Greedy search. Each stream needs its own instance.
 
-    The work arrays (3 MB for the reference patch) exist only during a search, because a stream is seldom
-    searched.
+    The work arrays (3 MB for the reference patch) exist only during a search, because searches are rare.
 
     Args:
         model: Joint distribution of the readings.
@@ -228,7 +227,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
-    """Copy the block of P of each upper and lower wire into ``of_upper`` and ``of_lower``."""
+    """Copy each upper and lower wire's block of P into ``of_upper`` and ``of_lower``."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         for i in range(lower):
@@ -242,7 +241,7 @@ def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
 
 @njit
 def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -> None:
-    """Subtract share · v vᵀ from the block of each upper and lower wire."""
+    """Subtract share · v vᵀ from each upper and lower wire's block."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         block, first = of_upper[u], u * lower

@@ -9,7 +9,7 @@ P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for Machine Learning,
 The responses to loads are computed for two models of the rubber. One is the half-space of the elastic prior,
 with three loads per cell. The other is a thin bonded layer, with one normal load per cell. With the
 half-space alone, correct readings of a thin layer appear to contradict each other: 91 of the 210 fields in
-``tests/solve/test_trust_on_a_thin_layer.py`` were not trusted. With both models, only 1 field was not
+``tests/solve/test_trust_on_a_thin_layer.py`` were not trusted. With both models, only one field was not
 trusted, and no faults were reported.
 """
 
@@ -113,18 +113,18 @@ class ReadingModel:
 
     @classmethod
     def of(cls, layout: PatchLayout) -> ReadingModel:
-        """Return the model of ``layout`` from a cache; the model is created on first use."""
+        """Return the cached model of ``layout``, created on first use."""
         return _model(layout)
 
     def level(self, number: int) -> Level:
-        """Return the distribution at ``kappa[number]``; it is computed on first use."""
+        """Return the distribution at ``kappa[number]``, computed on first use."""
         found = self._levels.get(number)
         if found is None:
             found = self._levels[number] = self._compute(number)
         return found
 
     def loads(self, number: int) -> LoadTables:
-        """Return the load tables at ``kappa[number]``; they are computed on first use."""
+        """Return the load tables at ``kappa[number]``, computed on first use."""
         found = self._loads.get(number)
         if found is None:
             found = self._loads[number] = self._load_tables(number)
@@ -158,7 +158,7 @@ class ReadingModel:
         upper, lower = self.shape
         m = upper * lower
         precision, weighted = np.empty((2, m, m))
-        covariance = np.full((m, m), np.nan)  # only the blocks of the wires are needed, and computed
+        covariance = np.full((m, m), np.nan)  # only the wires' blocks are needed
         vectors = np.ascontiguousarray(self.vectors_t.T)
         np.divide(self.vectors_t, self.shrink[number][:, None], out=weighted)
         of_upper, of_lower = wire_blocks(covariance, self.shape)
@@ -195,7 +195,7 @@ def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
 def evidences(  # noqa: PLR0913 - a kernel: arrays by name
     vectors_t: Float, shrink: Float, log_det: Float, z: Float, c: Float, out: Float
 ) -> int:
-    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,), and return the index of the maximum.
+    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the maximum.
 
     The constant −½ m ln 2π is omitted. ``c`` (m,) is a work array.
     """

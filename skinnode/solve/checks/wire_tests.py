@@ -1,14 +1,14 @@
-"""Tests of whole wires, for readings inconsistent with the other wires and for gain errors.
+"""Tests whole wires for gain errors and for readings that are inconsistent with the other wires.
 
-If the readings of a wire are delayed, or belong to another wire, each single reading may agree with the
-others within its uncertainty. Only a test of all readings of the wire then detects the fault. Let G be the
-readings of a wire, P the precision of all readings, S = P⁻¹ their covariance, and α = P z. The tests compare
-two hypotheses with that of a healthy wire:
+If the readings of a wire are delayed or belong to another wire, each individual reading may agree with the
+others within its uncertainty. Only a test of all readings of the wire together then detects the fault. Let G
+be the readings of a wire, P the precision of all readings, S = P⁻¹ their covariance, and α = P z. The tests
+compare two hypotheses with the hypothesis of a healthy wire:
 
 - Unrelated: z_G is independent of the other wires, with the distribution N(0, S_GG). The log evidence changes
   by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG.
-- Gain: all readings of the wire are wrong by the same factor 1 + c, c ~ N(0, τ²). The log evidence changes by
-  ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q), with q = 1ᵀ P_GG 1.
+- Gain: all readings of the wire are wrong by the same factor 1 + c, with c ~ N(0, τ²). The log evidence
+  changes by ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q), with q = 1ᵀ P_GG 1.
 
 Both expressions follow from the conditional distributions of a multivariate normal.
 """
@@ -38,7 +38,7 @@ Mask = NDArray[np.bool_]
 class WireTables:
     """Cholesky factors of each wire's blocks of P and S, at one κ.
 
-    The arrays for upper wires have the shape (U, K, K), those for lower wires (K, U, U).
+    The arrays have the shape (U, K, K) for upper wires and (K, U, U) for lower wires.
     """
 
     upper_p: Float
@@ -52,7 +52,7 @@ class WireTables:
     log_det_s: Float
     """(U + K,) ½ ln det S_GG of each wire."""
     sums: Float
-    """(U + K,) sum 1ᵀ P_GG 1 of the elements of P_GG of each wire."""
+    """(U + K,) sum 1ᵀ P_GG 1 of the elements of each wire's P_GG."""
 
     @classmethod
     def of(cls, p: Float, s: Float, shape: tuple[int, int]) -> WireTables:
@@ -106,7 +106,7 @@ class WireFinding:
     wire: int
     """Index of the wire: 0 to U − 1 for upper wires, U to U + K − 1 for lower wires."""
     factor: float
-    """Error common to all readings of the wire, in units of their noise; nan if the readings of the wire
+    """Error common to all readings of the wire, in units of their noise; NaN if the readings of the wire
     appear unrelated to those of the other wires."""
 
 

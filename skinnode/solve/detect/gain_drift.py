@@ -1,13 +1,14 @@
 """Gain drift of a patch: its prior, and the Kalman filter that tracks the gains.
 
 The logarithm of each reading contains three gains: those of its upper wire, its lower wire and the patch. The
-patch's gain changes with temperature. Each gain is a random walk. The filter estimates the gains from blocks
-of untouched frames, so its error is the error after the last block plus the drift since then. Over minutes, a
-steady drift at an unknown rate dominates the random walk, because its variance grows with the square of time.
+patch's gain changes with temperature. Each gain follows a random walk. The filter estimates the gains from
+blocks of untouched frames, so its error is the error after the last block plus the drift since then. Over
+minutes, a steady drift at an unknown rate dominates the random walk, because the variance of the drift grows
+with the square of time.
 
 A change common to all upper wires looks like a change common to all lower wires, or like a change in the
 patch's gain. The filter therefore uses coordinates v in which every change is visible: the readings change by
-Q v, with orthonormal columns of Q. All variances are in units of a reading's noise variance.
+Q v, and the columns of Q are orthonormal. All variances are in units of a reading's noise variance.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Growth:
     """Standard deviation of the patch's steady drift after one hour, divided by the noise."""
 
     def after(self, seconds: float) -> tuple[float, float]:
-        """Return the growth of a wire's variance and of the patch's variance in ``seconds``."""
+        """Return the growth of a wire's variance and of the patch's variance over ``seconds`` seconds."""
         hours, steady_h = seconds / 3600.0, max(seconds - MEASURED_S, 0.0) / 3600.0
         return (
             hours * self.drift**2 + (steady_h * self.steady) ** 2,
@@ -68,7 +69,8 @@ class GainFilter:
     basis_t: Float
     """(V, m) matrix Qᵀ with orthonormal rows."""
     to_gains: Float
-    """(U + K + 1, V) gains for given v. A combination of gains that affects no reading is zero."""
+    """(U + K + 1, V) matrix that converts v to gains. A combination of gains that affects no reading is
+    zero."""
     by_wires: Float
     """(V, V) covariance of v if the gains of all wires have a variance of 1."""
     by_patch: Float
@@ -77,13 +79,13 @@ class GainFilter:
     """(V, V) matrix whose element-wise product with the covariance of v, summed over all elements, is the
     variance of an upper wire's gain about the mean of the upper wires."""
     of_lowers: Float
-    """(V, V) matrix for the lower wires, like ``of_uppers``."""
+    """(V, V) matrix like ``of_uppers``, but for the lower wires."""
     of_mean: Float
     """(V,) coefficients of the mean change in all readings."""
 
     @classmethod
     def of(cls, shape: tuple[int, int], ratios: bytes) -> GainFilter:
-        """Return the filter of a patch from a cache.
+        """Return the cached filter of a patch.
 
         Args:
             shape: Numbers U and K of upper and lower wires.

@@ -14,9 +14,9 @@ from skinnode.solve.detect.gain_drift import GainFilter
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 SETTLED: Final = 1e-5
-"""Relative change in the variances from block to block below which the covariance counts as constant."""
+"""Relative change in the variances from block to block below which the covariance is considered constant."""
 WIRES, MEAN = 0, 1
-"""Positions of the variances in ``variances``."""
+"""Indices of the variances in ``variances``."""
 
 
 class GainArrays(ArrayTable):
@@ -39,7 +39,7 @@ class GainArrays(ArrayTable):
     expected: Annotated[NDArray[np.float64], "m"]
     """Changes expected without a touch."""
     offset: Annotated[NDArray[np.float64], "m"]
-    """Part of ``expected`` that the gains do not cause."""
+    """Part of ``expected`` not caused by the gains."""
     covariance: Annotated[NDArray[np.float64], "V V"]
     """Covariance of v after the newest frame in the estimate."""
     v: Annotated[NDArray[np.float64], "V"]
@@ -85,7 +85,7 @@ def gain_arrays(filter_: GainFilter) -> GainArrays:
 
 @njit_part
 def _invert(a: Float) -> None:
-    """Replace the symmetric positive definite matrix ``a`` by its inverse, by Gauss-Jordan elimination.
+    """Replace the symmetric positive definite matrix ``a`` with its inverse, using Gauss-Jordan elimination.
 
     No pivoting is needed for such matrices (Higham, Accuracy and Stability of Numerical Algorithms, 2002,
     section 14.4).
@@ -131,7 +131,7 @@ def _find_variances(its: GainArrays) -> None:
 
 @njit_part
 def _update_covariance(its: GainArrays, wires: float, patch: float, frames: int) -> None:
-    """Grow the covariance by the drift, then update it with a block; see :func:`use_block` for arguments.
+    """Add the drift to the covariance, then update it with a block; see :func:`use_block` for arguments.
 
     Most blocks of a stream are consecutive, so the covariance soon becomes constant.
     """

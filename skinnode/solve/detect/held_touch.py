@@ -1,14 +1,15 @@
 """Ongoing touch: decides when the touch has ended.
 
-While the patch is touched, the gains drift, so the expected readings at rest become less and less certain. A
+While the patch is touched, the gains drift, so the expected readings at rest become increasingly uncertain. A
 touch therefore ends in one of four ways:
 
 - the readings agree with the values that were expected at rest when the touch began;
-- the readings have moved back towards rest, and agree with the rest values within the drift since the onset;
+- the readings have moved back towards rest and agree with the rest values to within the drift since the
+  onset;
 - a small fraction of the touch remains and stays constant, because the rubber creeps;
-- the readings have agreed with the rest values, within the drift, for half an hour.
+- the readings have agreed with the rest values, to within the drift, for half an hour.
 
-A held press meets none of these conditions for ten minutes, however slight it is.
+A held press, however slight, meets none of these conditions for ten minutes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from skinnode.solve.detect.touch_test import TouchTest
 RESIDUE: Final = 0.15
 """Fraction of a touch's peak amplitude that may remain as creep."""
 RESIDUE_S: Final = 10.0
-"""Time without change after which such a remainder counts as creep, s."""
+"""Time without change after which such a remainder is considered creep, s."""
 FORGOTTEN_S: Final = 1800.0
 """Time after which a touch that is indistinguishable from drift ends, s."""
 AVERAGED_S: Final = 1.0
@@ -38,7 +39,7 @@ class HeldTouch:
     test: TouchTest
     """Test used at the onset."""
     average: Float
-    """(m,) average change in the readings, excluding the last frames."""
+    """(m,) average change in the readings, excluding the most recent frames."""
     average_features: Float
     """Features of ``average``; see :class:`skinnode.solve.detect.touch_statistic.TouchBasis`."""
     period_s: float
@@ -51,12 +52,12 @@ class HeldTouch:
     """Number of frames since the onset."""
     _still: int = 0  # number of frames since the last change
     _like_rest: int = 0  # number of successive frames that drift could explain
-    _lighter: bool = True  # False from a frame that drift cannot explain until a change towards rest
+    _lighter: bool = True  # False after a frame that drift cannot explain, until a change towards rest
 
     def follow(
         self, features: Float, at: int, oldest: Float, variance: float, later: TouchTest
     ) -> bool | None:
-        """Process a frame; return True if the touch ended, None if it ended and creep remains, else False.
+        """Process a frame; return True if the touch ended, None if creep remains, otherwise False.
 
         Args:
             features: (4, F) features of the last four frames.
@@ -97,7 +98,7 @@ class HeldTouch:
     def _follow_change(
         self, now: Float, oldest_features: Float, oldest: Float, variance: float, later: TouchTest
     ) -> None:
-        """Detect a change by comparing the last frames with the touch's average before these frames."""
+        """Detect a change by comparing the last frames with the average of the touch before them."""
         share = 1.0 / min(max(1.0, AVERAGED_S / self.period_s), self.frames)
         spread = variance * (1.0 / KEPT + share)
         average = self.average_features
@@ -111,7 +112,7 @@ class HeldTouch:
 
 
 def _energy(test: TouchTest, features: Float) -> float:
-    """Return ‖z‖² of the ``features``."""
+    """Return ‖z‖², given the ``features``."""
     z = test.rows @ features
     return float(z @ z)
 

@@ -24,9 +24,9 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISIER: Final = 1.25
-"""Minimum factor between a frame's noise and the detector's for the detector to adopt the frame's noise."""
+"""Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
 SAME: Final = 0.1
-"""Maximum relative change in noise for which a rest field stays valid."""
+"""Maximum relative change in noise that leaves a rest field valid."""
 
 
 class RestGate:
@@ -64,7 +64,7 @@ class RestGate:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the state of the stream."""
         self.detector.reset()
         self._verdict = TouchVerdict(None, 0.0, False)
         self._field: FieldFrame | None = None

@@ -32,7 +32,7 @@ BLOCK: Final = 4
 HELD_BACK: Final = 2.0
 """Maximum age of the newest frame in the estimate while the patch is untouched, blocks."""
 FINER: Final = math.sqrt(2.0)
-"""Ratio between successive drift levels that the detector distinguishes."""
+"""Ratio between successive drift levels distinguished by the detector."""
 PRIOR: Final = 8.0
 """Number of independent drift measurements after which the stated drift is ignored."""
 WITHIN_S: Final = 120.0
@@ -97,7 +97,7 @@ class SlowState:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the state of the stream."""
         gains = sum(self._shape) + 1
         its = self._arrays
         its.v[:], its.offset[:], its.expected[:] = 0.0, 0.0, 0.0
@@ -307,5 +307,5 @@ class SlowState:
 
 
 def _least(variances: tuple[float, ...], needed: float) -> int:
-    """Return the index of the smallest of the ascending ``variances`` that is at least ``needed``."""
+    """Return the index of the first of the ascending ``variances`` that is at least ``needed``."""
     return min(bisect.bisect_left(variances, 0.999 * needed), len(variances) - 1)

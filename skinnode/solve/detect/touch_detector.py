@@ -1,4 +1,4 @@
-"""Touch detector of one patch, which decides before a frame is solved whether the patch is touched.
+"""Touch detector of one patch: decides, before a frame is solved, whether the patch is touched.
 
 A touch begins when the statistic of a frame, or of the mean of three frames, exceeds its threshold
 (:mod:`skinnode.solve.detect.touch_test`). :mod:`skinnode.solve.detect.held_touch` decides when it has ended.
@@ -37,18 +37,19 @@ ENOUGH: Final = 0.5
 """Minimum fraction of usable readings. With fewer, the detector makes no decision."""
 ODD_READING: Final = 6.0
 """Change in a single reading, in standard deviations, above which a frame is solved and its data are checked.
-Noise exceeds this limit in one of 1,700,000 frames of 300 readings."""
+Noise exceeds this limit in 1 of 1,700,000 frames of 300 readings."""
 ODD_WIRE: Final = 8.0
 """Excess of a wire's χ², in standard deviations of χ², above which a frame is solved and its data are
-checked. Noise exceeds this limit in at most one of 25,000 frames."""
+checked. Noise exceeds this limit in at most 1 of 25,000 frames."""
 NOISE_FRAMES: Final = 400
 """Number of frames over which the noise is averaged."""
 NOISE_START: Final = 30
 """Weight of the stated noise, in frames."""
 QUIETER: Final = 0.6
-"""Ratio of a touched frame's noise variance to the average, below which the average counts as too large."""
+"""Ratio of a touched frame's noise variance to the average below which the average is considered too
+large."""
 NOISE_STEP: Final = 1.25
-"""Maximum factor between the average and a frame's noise variance; variances beyond it are clipped."""
+"""Maximum factor between the average and a frame's noise variance; larger deviations are clipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,7 @@ class TouchDetector:
     def _configure(self) -> None:
         """Create the slow state and the tests for the current noise.
 
-        The ratios between the readings' noise levels stay the same as at the start, so that the tests remain
+        The ratios between the readings' noise levels stay the same as at the start, so the tests remain
         valid.
         """
         sigma = np.hypot(self._factor * self._own, self._rounding)
@@ -156,14 +157,14 @@ class TouchDetector:
         self._use_test()
 
     def prepare(self) -> None:
-        """Compute all tests, so that none delays a frame. Patches with the same layout share the tests."""
+        """Compute all tests in advance, to avoid delays. Patches with the same layout share the tests."""
         self._tests.prepare()
 
     def _use_test(self) -> None:
         self._test: TouchTest = self._tests.test(*self._slow.level)
 
     def reset(self) -> None:
-        """Forget the stream; regard the patch as untouched and the baseline as fresh."""
+        """Discard the state of the stream; assume an untouched patch and a fresh baseline."""
         self.touched = False
         self._noise, self._noise_frames = 1.0, NOISE_START
         self._at, self._frames = 0, 0
@@ -179,7 +180,7 @@ class TouchDetector:
 
         Args:
             factor: Factor that multiplies the stated noise, excluding quantization.
-            noise: (U, K) stated noise; None to keep the current one.
+            noise: (U, K) stated noise; None to keep the current noise.
         """
         if factor == self._factor and noise is None:
             return

@@ -13,15 +13,15 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 KEPT: Final = 4
-"""Number of frames kept for the means."""
+"""Number of recent frames kept for computing means."""
 STATISTICS: Final = (1, 3, 4)
-"""Numbers of frames in the means for which the statistic is computed."""
+"""Numbers of frames averaged before the statistic is computed."""
 WORST, UPPER, LOWER, COUNT, MOTION, RATIO = 3, 4, 5, 6, 7, 8
-"""Positions of the other results in ``found``."""
+"""Indices of the other results in ``found``."""
 
 
 class TouchArrays(ArrayTable):
-    """Arrays of one patch's detector. Changes y are in units of the reading's noise."""
+    """Arrays of one patch's detector. Changes y are in units of each reading's noise."""
 
     ohm: Annotated[NDArray[np.float64], "U K"]
     """Resistances of the frame, ohm; NaN where missing."""

@@ -1,4 +1,4 @@
-"""Odds of touch to no touch: Bayes' rule, frame by frame, for a patch that is touched occasionally."""
+"""Odds of touch to no touch, updated each frame by Bayes' rule for a patch that is touched occasionally."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.model.layout import Float
 from skinnode.solve.detect.touch_statistic import DEPTH, MOST_OCTAVES, SHALLOWEST, Statistic
 
 DEEPEST: Final = 0.16
-"""Maximum RMS normal displacement in the odds, layer heights."""
+"""Maximum RMS normal displacement considered in the odds, in layer heights."""
 TOUCHES_PER_S: Final = 1.0 / 60.0
 """Prior rate of touches, 1/s."""
 TOUCH_S: Final = 1.0
@@ -19,7 +19,7 @@ TOUCH_S: Final = 1.0
 
 
 def octaves_for(noise: float) -> int:
-    """Return the number of octaves of depth in the odds for the relative ``noise``."""
+    """Return the number of octaves of depth considered in the odds at the relative noise ``noise``."""
     most = math.log2(DEEPEST / (DEPTH * noise * SHALLOWEST))
     return min(1 + max(int(most), 0), MOST_OCTAVES)
 

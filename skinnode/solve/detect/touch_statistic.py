@@ -1,9 +1,9 @@
-"""Statistic of the touch test: a quadratic form of the readings, one for each uncertainty of the gains.
+"""Statistics of the touch test: a quadratic form in the readings for each level of gain uncertainty.
 
 Let y = ln(R₀/R)/σ be the changes in the readings from rest, in units of their noise, after subtraction of the
 estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ includes the noise and the errors in the
 gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
-readings' response to loads at a depth that noise almost hides. A touched frame therefore has
+readings' response to loads at a depth that is almost hidden by noise. A touched frame therefore has
 y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
     T = yᵀ (V₀⁻¹ − (V₀ + B Bᵀ)⁻¹) y
@@ -12,10 +12,10 @@ With the eigenvectors u_i and eigenvalues μ_i of Bᵀ V₀⁻¹ B, T is the sum
 u_iᵀ Bᵀ V₀⁻¹ y. Without a touch, the z_i are independent with the variances d_i = μ_i / (1 + μ_i).
 
 Bᵀ V₀⁻¹ y is a combination of Bᵀ y and Hᵀ y, the *features* of the frame, which do not depend on P. A
-statistic is therefore a small matrix that multiplies the features. The statistics for all uncertainties of
-the gains are computed before a stream starts, and choosing another one during a stream takes microseconds.
-P is diagonal: wires have one of the variances :data:`WIRE_VARIANCES`, and the patch has one of
-:data:`PATCH_VARIANCES`.
+statistic is therefore a small matrix that multiplies the features. The statistics for all levels of gain
+uncertainty are computed before a stream starts; switching to another statistic during a stream takes
+microseconds. P is diagonal: the variance of the wires' gains is one of :data:`WIRE_VARIANCES`, and that of
+the patch's gain is one of :data:`PATCH_VARIANCES`.
 
 The odds of touch also account for other depths: at a depth c times as large, c² μ_i replaces μ_i. The log
 likelihood ratio is then ½ Σ (c² μ_i / (1 + c² μ_i) z_i² / d_i − ln(1 + c² μ_i)).
@@ -39,13 +39,13 @@ DEPTH: Final = 5.0
 noise of 1e-3, this is 0.5 % of the layer height. Tests for 0.25 % to 1 % detect touches almost equally well.
 Tests for 2 % or more detect fewer of the presses that are 2 % deep."""
 SHALLOWEST: Final = 0.5
-"""Minimum RMS normal displacement in the odds, relative to that in the alternative hypothesis."""
+"""Minimum RMS normal displacement considered in the odds, relative to the alternative hypothesis."""
 MOST_OCTAVES: Final = 24
-"""Maximum number of octaves of depth in the odds; enough for noise down to 1e-8."""
+"""Maximum number of octaves of depth considered in the odds; enough for noise down to 1e-8."""
 LEAST_WEIGHT: Final = 0.02
-"""Minimum weight κ² λ of an eigenvector of the elastic prior in the test."""
+"""Minimum weight κ² λ of the elastic prior's eigenvectors used in the test."""
 MOST_VECTORS: Final = 96
-"""Maximum number of eigenvectors of the elastic prior in the test. The cost is proportional to this
+"""Maximum number of the elastic prior's eigenvectors used in the test. The cost is proportional to this
 number."""
 WIRE_VARIANCES: Final = (*(2.0 ** np.arange(-9.0, 2.0)).tolist(), 1e6)
 """Variances of a wire's gain about the mean of its layer, in units of a reading's noise variance. The
@@ -56,7 +56,7 @@ PATCH_VARIANCES: Final = (*(2.0 ** np.arange(-12.0, 0.0)).tolist(), 1e6)
 
 @dataclass(frozen=True, eq=False)
 class Statistic:
-    """Statistic for one uncertainty of the gains."""
+    """Statistic for one level of gain uncertainty."""
 
     rows: Float
     """(r, r + U + K + 1) matrix that multiplies the features (Bᵀ y, Hᵀ y) and yields z."""
@@ -102,7 +102,7 @@ class TouchBasis:
 
     @classmethod
     def of(cls, layout: PatchLayout, ratios: bytes) -> TouchBasis:
-        """Return the basis of a patch from a cache; see :class:`TouchBasis`."""
+        """Return the cached basis of a patch; see :class:`TouchBasis`."""
         return _basis(layout, ratios)
 
     def features(self, y: Float) -> Float:
@@ -110,7 +110,7 @@ class TouchBasis:
         return np.concatenate([self.responses_t @ y.ravel(), self.effect.T @ y.ravel()])
 
     def statistic(self, wires: int, patch: int) -> Statistic:
-        """Return the statistic for two levels of the gains' variances; it is computed on first use.
+        """Return the statistic for two levels of the gains' variances, computed on first use.
 
         Args:
             wires: Index in :data:`WIRE_VARIANCES`.

@@ -1,4 +1,4 @@
-"""Touch test of a frame: the statistic of :mod:`skinnode.solve.detect.touch_statistic`, and its thresholds.
+"""Touch test for a frame: the statistic of :mod:`skinnode.solve.detect.touch_statistic`, and its thresholds.
 
 The thresholds follow from the distribution of the statistic without a touch
 (:mod:`skinnode.solve.detect.weighted_chi_squared`). In the mean of w successive frames, the squared
@@ -24,9 +24,9 @@ from skinnode.solve.detect.touch_statistic import (
 from skinnode.solve.detect.weighted_chi_squared import upper_quantile
 
 WINDOWS: Final = (1, 3)
-"""Numbers of frames in the means that are tested for the onset of a touch."""
+"""Numbers of frames averaged in the tests for the onset of a touch."""
 RELEASE_FRAMES: Final = 4
-"""Number of frames in the mean that is tested for the release of a touch."""
+"""Number of frames averaged in the test for the release of a touch."""
 RELEASE_CHANCE: Final = 0.01
 """Probability that noise alone delays the release of a touch by one frame."""
 CHANGE_CHANCE: Final = 1e-6
@@ -50,7 +50,7 @@ class Thresholds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TouchTest:
-    """Touch test for one patch, one false-alarm rate and one uncertainty of the gains."""
+    """Touch test for one patch, one false-alarm rate and one level of gain uncertainty."""
 
     statistic: Statistic
     """Statistic."""
@@ -64,7 +64,7 @@ class TouchTest:
 
 
 class TouchTests:
-    """Touch tests of one patch for all uncertainties of the gains.
+    """Touch tests of one patch for all levels of gain uncertainty.
 
     Args:
         basis: Features and statistics of the patch.
@@ -93,7 +93,7 @@ class TouchTests:
         return found
 
     def prepare(self) -> None:
-        """Compute all tests, so that none delays a frame."""
+        """Compute all tests in advance, so that none of them delays a frame."""
         for wires in range(len(WIRE_VARIANCES)):
             for patch in range(len(PATCH_VARIANCES)):
                 self.test(wires, patch)
@@ -125,7 +125,7 @@ def touch_tests(
 
 @functools.lru_cache(maxsize=4096)
 def _thresholds(basis: TouchBasis, wires: int, patch: int, chance: float) -> tuple[Thresholds, Thresholds]:
-    """Return the thresholds for noise that is independent in each frame, and for noise that is not."""
+    """Return the thresholds for independent noise, and for noise that is the same in all frames."""
     statistic = basis.statistic(wires, patch)
     one, three = statistic.weights, statistic.weights_of_mean(WINDOWS[1])
     four = statistic.weights_of_mean(RELEASE_FRAMES)

@@ -2,8 +2,8 @@
 
 The tail of T = Σ w_i z_i² for independent standard normal z_i follows from the cumulant generating function
 K(t) = −½ Σ ln(1 − 2 t w_i) by the saddle-point approximation of Lugannani and Rice (Advances in Applied
-Probability 12, 1980, 475-490). For the weights of the touch test, its relative error is below 2 % down to
-probabilities of 1e-7 (``tests/solve/test_weighted_chi_squared.py``).
+Probability 12, 1980, 475-490). For the weights of the touch test, the relative error of the approximation is
+below 2 % down to probabilities of 1e-7 (``tests/solve/test_weighted_chi_squared.py``).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def upper_quantile(weights: Float, probability: float) -> float:
 
 @njit_part
 def _saddle_point(weights: Float, value: float) -> float:
-    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, by Newton's method within two bounds."""
+    """Return t with K'(t) = Σ w_i / (1 − 2 t w_i) = ``value``, found by Newton's method within bounds."""
     largest = 0.0
     for i in range(weights.size):
         largest = max(largest, weights[i])
@@ -115,7 +115,7 @@ def _tail_of(weights: Float, value: float) -> float:
 def _quantile(weights: Float, probability: float) -> float:
     """Return the value that Σ w_i z_i² exceeds with the given probability.
 
-    Regula falsi with the Illinois rule; the logarithm of the probability is nearly linear in the tail.
+    Uses regula falsi with the Illinois rule; the logarithm of the probability is nearly linear in the tail.
     """
     wanted, low, high = math.log(probability), 0.0, 0.0
     for i in range(weights.size):

@@ -1,9 +1,9 @@
-"""Estimate of the loads and contacts that explain a displacement field from the exact inverse.
+"""Estimates the loads and contacts that explain a displacement field of the exact inverse.
 
 The field u is modelled as the sum of three terms:
 
 - G q: displacement due to the loads q ~ N(0, s²) of the elastic prior;
-- slack: displacement not explained by loads, with the standard deviation ε s;
+- slack: displacement not explained by loads, with a standard deviation of ε s;
 - e ~ N(0, ν² Σ): error of the exact inverse, with the error covariance Σ at rest. The factor ν² is computed
   from the standard deviations of the field.
 
@@ -44,9 +44,9 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 UNTOUCHED: Final = 4.0
-"""Largest displacement, in standard deviations, up to which a patch counts as untouched.
+"""Maximum displacement, in standard deviations, of a patch that is considered untouched.
 
-Noise alone exceeds this limit in 2 % of the frames, which are then searched for contacts.
+Noise alone exceeds this limit in 2 % of frames, which are then searched for contacts.
 """
 WILD: Final = 16.0
 """Ratio of a wire's variance to the median over all wires above which the wire is left out. All variances are
@@ -61,7 +61,7 @@ SCALE_LEAST: Final = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadFactors:
-    """Matrices of one patch at one noise level; for the symbols, see the docstring of the module."""
+    """Matrices of one patch at one noise level; the module's docstring defines the symbols."""
 
     prior: ElasticPrior
     whitening: Float
@@ -77,7 +77,7 @@ class LoadFactors:
 
 
 class ExactContacts:
-    """Estimator of the contacts in a stream of exact fields; each stream needs its own instance.
+    """Estimates the contacts in a stream of exact fields; each stream needs its own instance.
 
     Args:
         layout: The patch.
@@ -187,7 +187,7 @@ class ExactContacts:
     def _estimate_without(self, left_out: NDArray[np.bool_], level: float) -> LoadEstimate:
         """Return the loads that explain the displacement of all wires except ``left_out`` (U,).
 
-        For the scale s, the wires left out are assumed to be at their most probable positions.
+        The scale s is computed with the wires left out at their most probable positions.
         """
         factors, gone = self._factors, left_out[self._wire]
         moved = np.where(gone, 0.0, self._moved)
@@ -280,7 +280,7 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
     ratio: Float,
     ordered: Float,
 ) -> tuple[float, float, bool]:
-    """Find the largest displacement in a field, and detect wires with unusually large standard deviations.
+    """Find the largest displacement in a field and the wires with unusually large standard deviations.
 
     Args:
         field: (2, 3UN) displacements and their standard deviations, m.
@@ -290,10 +290,10 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
         moved: (n,) output: displacements of the free coordinates, pitches.
         ratio: (U,) output: each wire's mean ratio of a variance to the variance at rest; inf if a variance is
             infinite.
-        ordered: (U,) scratch.
+        ordered: (U,) work array.
 
     Returns:
-        The largest displacement, in standard deviations; the median of the finite ratios; and whether any
+        The largest displacement, in standard deviations; the median of the finite ratios; and True if any
         wire's ratio exceeds :data:`WILD` times the median.
     """
     largest, each, known = 0.0, free.size // ratio.size, 0

@@ -4,7 +4,7 @@ Both options reduce the number of unknowns. The coordinates that are not unknown
 
 ``normal_only`` fixes the x and y coordinates of all electrodes.
 
-``active_only`` fixes the electrodes that no contact moves. At first, all electrodes of a wire are fixed.
+``active_only`` fixes the electrodes not moved by a contact. At first, all electrodes of a wire are fixed.
 While the χ² test rejects the fit, the fixed electrode that explains most of the residual becomes an unknown,
 together with its neighbours. Once more than half of the electrodes would be unknowns, all of them become
 unknowns. When the rest position explains a frame again, all electrodes are fixed again.
@@ -90,7 +90,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Fix the wires that are at rest within noise; write the standard deviations of fixed coordinates."""
+        """Fix the wires at rest within the noise; write the standard deviations of fixed coordinates."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -109,7 +109,7 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Add unknowns to processed wires whose residual exceeds noise; return a mask (U,) of these wires.
+        """Add unknowns to processed wires whose residual exceeds the noise; return their mask (U,).
 
         Args:
             frame: The current frame.
@@ -122,7 +122,7 @@ class LeftOut:
         return unexplained
 
     def _set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Make the given electrodes of wire u its unknowns, and fix all its other electrodes."""
+        """Make the given electrodes of wire u its unknowns and fix its other electrodes."""
         solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
         arrays.predictable[u] = len(electrodes) == 0
@@ -154,7 +154,7 @@ class LeftOut:
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of the wires that have a root within noise, or that have no fixed electrode."""
+        """Return a mask (U,) of the wires that have a root within the noise or no fixed electrode."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
@@ -163,7 +163,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add unknowns to wire u until its residual is within noise; remove them again if it has no root."""
+        """Add unknowns to wire u until its residual is within the noise; remove them if it has no root."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:

@@ -1,4 +1,4 @@
-"""Recovery of wires for which the solver found no acceptable root in a frame.
+"""Recovers wires for which the solver found no acceptable root in a frame.
 
 A wire is recovered in three stages:
 
@@ -23,7 +23,7 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Numbers of substeps of successive bridges.
+"""Numbers of substeps in successive bridges.
 
 On the staggered layout (h = 0.5), 3 substeps solved every wire after a press of 50 % of h within one frame; 5
 substeps solved 23 of 24 wires after a press of 70 %. Adaptive substeps that stay on the branch of the rest
@@ -34,7 +34,7 @@ BRIDGE_TOLERANCE: Final = 1e-6
 BRIDGE_STEPS: Final = 20
 """Maximum number of solver steps per substep."""
 RECOVERY_STEPS: Final = 300
-"""Number of solver steps in a frame (about 15 ms) above which no further bridge is started.
+"""Number of solver steps per frame (about 15 ms) above which no further bridge is started.
 
 The limit prevents a corrupt frame from stalling the stream.
 """
@@ -46,7 +46,7 @@ _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE
 def recover_lost(
     stream: StreamState, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
 ) -> None:
-    """Recover the wires without an acceptable root; write ``good`` and ``status`` of the stream's arrays.
+    """Recover the wires without an acceptable root; update ``good`` and ``status`` of the stream.
 
     Args:
         stream: State of the stream.
@@ -96,9 +96,9 @@ def _bridge(  # noqa: PLR0913 - both ends of the bridge
 ) -> bool:
     """Solve wire u in ``substeps`` equal substeps from the resistances ``a_from`` (K,) to those of the frame.
 
-    The outcome of the last substep is in the solver's report. The interpolated resistances do not belong to a
-    deformation of the skin, so the solutions of the other substeps may be on any branch. Returns False if the
-    deadline interrupts the bridge.
+    The outcome of the last substep is in the solver's report. The interpolated resistances do not correspond
+    to any deformation of the skin, so the solutions of the other substeps may be on any branch. Returns False
+    if the deadline interrupts the bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

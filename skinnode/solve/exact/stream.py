@@ -1,4 +1,4 @@
-"""State of a stream that the modules of the exact tracker share: solver, arrays and acceptance of roots.
+"""State of a stream, shared by the exact tracker's modules: solver, arrays and acceptance of roots.
 
 A root of F = b is accepted only if it passes two tests. Each electrode must be within its clearance of its
 rest position; the clearance is its distance at rest from the nearest lower electrode. The determinant of J
@@ -35,7 +35,7 @@ reduces an error of 1e-5 to less than 1e-9.
 FRAME_STEPS: Final = 12
 """Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Tasks of each solve: compute the covariance, and reuse the last J⁻¹ where possible."""
+"""Tasks of each solve: compute the covariance and reuse the last J⁻¹ where possible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +107,7 @@ class StreamState:
             todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
             frame: Frame that provides σ and the order of the wires.
             a: (U, K) scaled resistances; default: those of the frame.
-            options: Options of the solve; default: those of the stream.
+            options: Options for the solve; default: those of the stream.
             units: Time limit, as in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(

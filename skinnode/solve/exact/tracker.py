@@ -39,13 +39,13 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Upper bound on the time of one solver step, including one evaluation of F and J, seconds.
+"""Upper bound on the time for one solver step, including one evaluation of F and J, seconds.
 
 Each call of the solver processes all wires that are certain to finish before the deadline. Ten calls instead
 of one would cost as much extra time as solving ten more wires.
 """
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Maximum computing time of one wire in one frame, in units of one evaluation of F and J plus one step."""
+"""Maximum computing time for one wire in one frame, in units of one evaluation of F and J plus one step."""
 
 
 class ExactTracker:
@@ -56,19 +56,19 @@ class ExactTracker:
     Args:
         layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
-        relative_noise: Relative standard deviation of R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors of resistivity and gain
+        relative_noise: Relative standard deviation of R, scalar or (U, K).
+        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors in resistivity and gain
             cancel.
         stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, N/m. If given, each field contains
             the forces F.
         hold: Whether to keep the last position of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed it by the time that one wire takes.
+        deadline_us: Time limit for an update, µs; an update can exceed it by the time needed for one wire.
             Wires not processed by the deadline have the status DEADLINE and an infinite standard deviation,
             and are processed first in the next frame.
         normal_only: Whether to fix x and y at rest and solve for z only.
         active_only: Whether to fix electrodes at rest unless a contact moves them.
-        codes: Mapping of the codes passed to :meth:`update_codes` to resistances.
+        codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
         noise_estimate: Estimator of the stream's noise, which scales the stated noise. :meth:`reset` does not
             reset it.
 
@@ -149,7 +149,7 @@ class ExactTracker:
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False for missing readings; default: all True.
-            relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
+            relative_noise: Relative standard deviation of the resistances of this frame, scalar or (U, K);
                 default: as in the constructor. A resistance is ignored if its standard deviation is not
                 positive and finite.
             left_out: (U, K) bool, True for valid readings that the solve ignores. The noise estimate still
@@ -279,7 +279,7 @@ class ExactTracker:
         return residual
 
     def _complete(self) -> None:
-        """Write the values of ``a`` that each solution predicts for missing readings to ``a_solved``."""
+        """Write to ``a_solved`` the values of ``a`` that each solution predicts for missing readings."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -287,7 +287,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Use the given displacements (U, N, 3), m, as the last solutions of the wires in the mask (U,)."""
+        """Use the displacements (U, N, 3), in metres, as the last solutions of the wires in the mask (U,)."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # solve for all electrodes of these wires again
@@ -298,13 +298,13 @@ class ExactTracker:
             arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
-        """Start the wires in the mask (U,) at rest in the next frame, whatever this frame's outcome."""
+        """Start the wires in the mask (U,) at rest in the next frame, regardless of this frame's outcome."""
         problem, arrays = self._stream.problem, self.arrays
         arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
         arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
-        """Solve at least one wire, and further wires while time remains."""
+        """Solve at least one wire, and more wires while time remains."""
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)

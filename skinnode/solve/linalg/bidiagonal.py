@@ -19,8 +19,8 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 ) -> None:
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
-    The algorithm is that of Golub & Van Loan, 5.4.8, with rows and columns exchanged. The squares of the
-    elements of A must not overflow.
+    The algorithm is that of Golub & Van Loan, section 5.4.8, with rows and columns exchanged. The squares of
+    the elements of A must not overflow.
 
     Args:
         a: A, padded with zeros to (n + 3, m), with m rounded up to whole SIMD vectors. The padding allows
@@ -31,7 +31,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         upper: (n,) output: superdiagonal of B, followed by 0.
         across: (n,) output: factors β of the reflectors of Q.
         down: (n,) output: factors β of the reflectors of P.
-        w: Scratch, as long as a row of ``a``.
+        w: Work array, as long as a row of ``a``.
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):

@@ -219,7 +219,7 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 
 @njit
 def solve_positive(a: Float, b: Float, n: int) -> bool:
-    """Replace the leading n elements of ``b`` with A⁻¹ b, and the symmetric ``a`` (n, n) with its factor.
+    """Replace the leading n elements of ``b`` with A⁻¹ b and the symmetric ``a`` (n, n) with its factor.
 
     Returns whether ``a`` is positive definite; if it is not, ``b`` does not change.
     """

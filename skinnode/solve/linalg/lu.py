@@ -1,9 +1,9 @@
 """LU factorisation of a small square matrix, for the Jacobian of one wire.
 
 These kernels replace LAPACK for two reasons. With 30 unknowns, the overhead of a LAPACK call exceeds the time
-of the arithmetic, and ``numpy.linalg`` in compiled code adds seconds of compile time. The kernels factor Jᵀ,
+for the arithmetic, and ``numpy.linalg`` in compiled code adds seconds of compile time. The kernels factor Jᵀ,
 so that inner loops run along contiguous rows, and vectorisation does not reorder sums (Golub & Van Loan,
-Matrix Computations, 4th ed., 3.4).
+Matrix Computations, 4th ed., section 3.4).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Householder QR factorisation of a small tall matrix, for wires with more equations than unknowns.
 
-The normal equations would square the condition number (Golub & Van Loan, Matrix Computations, 4th ed., 5.2,
-5.3).
+The normal equations would square the condition number (Golub & Van Loan, Matrix Computations, 4th ed.,
+sections 5.2 and 5.3).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> in
             of Q.
         diagonal: (n,) output: diagonal of R.
         beta: (n,) output: factors β of the reflectors.
-        w: (n,) scratch.
+        w: (n,) work array.
     """
     n, m = jt.shape
     for j in range(n):
@@ -83,7 +83,7 @@ def r_solve(a: Float, diagonal: Float, b: Float) -> None:
 
 @njit_part
 def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float) -> None:  # noqa: C901 - loops
-    """Write J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m); ``v`` (m,) is scratch."""
+    """Write J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m); ``v`` (m,) is a work array."""
     m, n = a.shape
     for j in range(n):
         row = inverse[j]

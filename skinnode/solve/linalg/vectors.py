@@ -1,4 +1,4 @@
-"""Vector operations of the kernels: products, norms, and rows padded to whole SIMD vectors."""
+"""Vector operations for the kernels: products, norms, and rows padded to whole SIMD vectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Attempt of ``solve_system``: runs an operator with one initial trust region, and classifies the last point.
+"""Attempt of ``solve_system``: runs an operator with one initial trust region and classifies the last point.
 
 The compiled loop reports CONVERGED at roots and near stationary points of ‖r‖. An attempt then decides
 whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
@@ -22,7 +22,8 @@ from skinnode.solve.operators.result import PointKind
 from skinnode.solve.operators.work import LIMIT, NORM, workspace
 
 NEAR: Final = 1e-2
-"""Largest cosine between r and a column of J below which an attempt changes to Newton's method for a minimum.
+"""Largest cosine between r and a column of J below which an attempt switches to Newton's method for a
+minimum.
 
 Near a minimum with a large residual, the operators converge only linearly: they take 454 steps on the problem
 of Brown & Dennis.
@@ -30,7 +31,7 @@ of Brown & Dennis.
 
 
 class System:
-    """Wrapper of the caller's functions that counts the calls and validates the returned arrays.
+    """Wrapper around the caller's functions that counts calls and validates the returned arrays.
 
     The returned array can be the caller's own, which the next call may overwrite.
     """
@@ -48,12 +49,12 @@ class System:
         self.m = self.first.size
 
     def residual(self, x: Float) -> Float:
-        """Return r (m,) at x. Raises ValueError if the caller's function returns another shape."""
+        """Return r (m,) at x. Raises ValueError if the caller's function returns the wrong shape."""
         self.evaluations += 1
         return require_array("residual(x)", self._residual(x.copy()), (self.m,), finite=False)
 
     def jacobian(self, x: Float) -> Float:
-        """Return J (m, n) at x. Raises ValueError if the caller's function returns another shape."""
+        """Return J (m, n) at x. Raises ValueError if the caller's function returns the wrong shape."""
         self.jacobians += 1
         j, shape = self._jacobian(x.copy()), (self.m, self.n)
         if type(j) is np.ndarray and j.dtype == np.float64 and j.shape == shape:
@@ -128,7 +129,7 @@ class Attempt:
             self.settle(tol_x, left)
 
     def _is_root(self, tol_f: float) -> bool:
-        """Return whether the solve ended at a root; estimate the error of x.
+        """Return whether the solve ended at a root; estimate the error in x.
 
         If the error is too large, CONVERGED becomes ILL_CONDITIONED.
         """
@@ -143,7 +144,7 @@ class Attempt:
         return self.ended and float(np.abs(w.r).max()) <= tol_f
 
     def settle(self, tol_x: float, steps: int) -> None:
-        """Move to a nearby minimum of ‖r‖ by Newton's method, and classify the stationary point reached."""
+        """Move to a nearby minimum of ‖r‖ by Newton's method and classify the stationary point reached."""
         at, system, converged = self.at, self._system, self.went == op.CONVERGED
         if converged:
             self.went = op.ILL_CONDITIONED

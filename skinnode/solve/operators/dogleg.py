@@ -11,7 +11,7 @@ from skinnode.solve.operators.work import RADIUS, SINGULAR, Work, times_jacobian
 
 @njit_part
 def dogleg_step(w: Work) -> None:
-    """Set the dogleg step: along −D⁻²g to the Cauchy point, then towards the Newton point, to the radius."""
+    """Set the dogleg step: along −D⁻²g to the Cauchy point, then to the Newton point; stop at the radius."""
     n, radius = w.x.size, w.s[RADIUS]
     square = 0.0
     for j in range(n):
@@ -35,7 +35,7 @@ def dogleg_step(w: Work) -> None:
         weight = w.scale[j] ** 2
         a += weight * leg * leg
         b += weight * leg * w.step[j]
-    if a == 0.0:  # the Cauchy point is the Newton point, as always with one unknown
+    if a == 0.0:  # the Cauchy point is the Newton point, which is always so with one unknown
         return
     root = math.sqrt(b * b - a * c)
     share = min(-c / (b + root) if b > 0.0 else (root - b) / a, 1.0)

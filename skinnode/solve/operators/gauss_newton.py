@@ -1,7 +1,7 @@
 """Newton step −J⁺ r, which Gauss-Newton takes in full (Xu et al. 2018, eq. 8), and error estimates.
 
 After a step to a point with the residual r₊, the simplified correction −J⁺ r₊ with the previous J estimates
-the error of x (Deuflhard, Newton methods for nonlinear problems, 2004).
+the error in x (Deuflhard, Newton methods for nonlinear problems, 2004).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def settled(w: Work, tol_f: float, tol_x: float) -> bool:
 
 @njit_part
 def correction(w: Work, r: Float, out: Float) -> float:
-    """Write −J⁺ r, with the current factors of J, into ``out`` (n,); return its maximum norm."""
+    """Write −J⁺ r into ``out`` (n,), using the current factors of J; return its maximum norm."""
     n = out.size
     if w.r.size == n:
         for j in range(n):
@@ -109,10 +109,10 @@ def rounding(w: Work, x: Float) -> float:
 
 @njit_part
 def estimate_error(w: Work, inverse: Float) -> float:
-    """Write J⁺, with the last factors of J, into ``inverse`` (n, m); return an estimate of the error of x.
+    """Write J⁺ into ``inverse`` (n, m), using the last factors of J; return an estimate of the error in x.
 
     The estimate is relative to max(1, ‖x‖∞). It is the sum of the last Newton correction and the error due to
-    rounding of x, which grows with the condition number of J. If J is singular, it is inf.
+    rounding of x, which grows with the condition number of J. If J is singular, the estimate is inf.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -79,7 +79,7 @@ def marquardt_step(w: Work) -> None:  # noqa: C901 - Moré's iteration in one pi
 
 @njit_part
 def _decrease(inverse: Float, upper: Float, t: Float, length: float, v: Float) -> float:
-    """Return ‖R⁻ᵀ t / ‖t‖‖², the relative decrease in ‖t‖ per unit of lam; ``v`` (n,) is scratch."""
+    """Return ‖R⁻ᵀ t / ‖t‖‖², the relative decrease in ‖t‖ per unit of lam; ``v`` (n,) is a work array."""
     share = 1.0 / length
     for j in range(t.size):
         v[j] = t[j] * share

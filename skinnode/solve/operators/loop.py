@@ -1,4 +1,4 @@
-"""Iteration loop of all operators, with reverse communication: the caller evaluates r and J.
+"""Iteration loop for all operators, with reverse communication: the caller evaluates r and J.
 
 - ``begin`` starts at x, with r and J in the workspace.
 - ``propose`` factors J and, unless x is a root or a minimum, makes the Newton step the next ``trial``.
@@ -14,8 +14,8 @@ Newton correction with the current factors satisfies ‖J⁻¹ r₊‖∞ ≤ to
 r above tol_f, an r within the rounding error of J·x counts as zero.
 
 For a tall system, CONVERGED means a root or a minimum. At a minimum, ‖P r‖ ≤ tol_f ‖r‖, where P projects onto
-the range of J, and the correction meets the second condition above. The module ``minimum`` tells minima from
-saddles.
+the range of J, and the correction meets the second condition above. The module ``minimum`` distinguishes
+minima from saddle points.
 
 A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
 """
@@ -139,7 +139,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Return whether ``r_trial``, with the Euclidean norm ``norm``, consists of rounding errors only."""
+    """Return whether ``r_trial``, with the Euclidean norm ``norm``, consists only of rounding errors."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)
@@ -178,16 +178,16 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """Wrapper of :func:`begin` for calls from Python."""
+    """Run :func:`begin`; called from Python."""
     return begin(w)
 
 
 @njit
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
-    """Assess the last trial point; propose the next if it was rejected. Called from Python.
+    """Assess the last trial point; if it was rejected, propose the next one. Called from Python.
 
-    ``went`` is the return value of the previous call; for the first call, REJECTED. Returns TRY (then write r
-    at ``trial`` to ``r_trial``), ACCEPTED (then write Jᵀ at ``x`` to ``jt``) or a Status.
+    ``went`` is the return value of the previous call, or REJECTED for the first call. Returns TRY (then write
+    r at ``trial`` to ``r_trial``), ACCEPTED (then write Jᵀ at ``x`` to ``jt``) or a Status.
     """
     if went == TRY:
         went = assess(operator, w, tol_f, tol_x)
@@ -199,5 +199,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """Wrapper of :func:`estimate_error` for calls from Python."""
+    """Run :func:`estimate_error`; called from Python."""
     return estimate_error(w, inverse)

@@ -6,7 +6,7 @@ D V (Σ² + C) Vᵀ D. This form avoids the product JᵀJ.
 
 The test scales Σ² + C: row k and column k are divided by √(σ_k² + ν), where ν is the rounding error of C. The
 smallest eigenvalue of the scaled matrix is 1 at a minimum with r = 0, about 0 at a flat point, and negative
-at a saddle.
+at a saddle point.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DIFFERENCE: Final = EPS ** (1 / 3)
 NOISE: Final = EPS ** (2 / 3)
 """Relative rounding error of a central difference with the step :data:`DIFFERENCE`."""
 CURVED: Final = 0.05
-"""Limit above which the smallest scaled eigenvalue of the Hessian counts as positive.
+"""Limit above which the smallest scaled eigenvalue of the Hessian is considered positive.
 
 On the problems of Moré, Garbow & Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38
 at isolated minima. The exception is Watson's problem with n = 12: because of rounding errors, it is 0.003 at
@@ -41,7 +41,7 @@ NEWTON_STEPS: Final = 8
 
 @dataclass(frozen=True)
 class Point:
-    """A point with its residual and Jacobian."""
+    """A point, its residual and its Jacobian."""
 
     x: Float
     r: Float
@@ -80,7 +80,7 @@ class Curvature:
     step: Float
     """(n,) Newton step towards Jᵀr = 0."""
     error: float
-    """Largest error of a coordinate of the minimum due to rounding of r, J and x."""
+    """Largest error in a coordinate of the minimum due to rounding of r, J and x."""
 
     @property
     def positive(self) -> bool:
@@ -151,7 +151,7 @@ def settle(
         residual: Function that returns r (m,) for x (n,).
         jacobian: Function that returns J (m, n) for x (n,).
         at: Starting point.
-        tol_x: Largest remaining step, relative to max(1, max|x|).
+        tol_x: Maximum size of the remaining step, relative to max(1, max|x|).
         max_steps: Maximum number of Newton steps.
     """
     before = math.inf
@@ -166,6 +166,6 @@ def settle(
         if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
             break
         before, at = size, Point(x, r, jacobian(x))
-    # If Jᵀr consists of rounding errors only, the steps no longer contract, but the point is stationary.
+    # If Jᵀr consists only of rounding errors, the steps no longer contract, but the point is stationary.
     known = bent.positive and (reached or at.cosine <= STATIONARY)
     return Settled(at, bent.lowest, size + bent.error if known else math.inf)

@@ -16,7 +16,7 @@ class PointKind(enum.Enum):
     """Kind of point at which ``solve_system`` stopped."""
 
     ROOT = "root"
-    """r is zero, within ``tol_f`` or within the error due to rounding of x."""
+    """r is zero to within ``tol_f`` or the error due to rounding of x."""
     MINIMUM = "minimum"
     """‖r‖ has an isolated minimum above zero: Jᵀr is zero, and the Hessian of ½ ‖r‖² is positive definite."""
     FLAT = "flat"
@@ -40,7 +40,7 @@ class Solution:
     that the equations do not determine, or a minimum of a square system with r ≠ 0.
     """
     kind: PointKind
-    """Kind of point that ``x`` is."""
+    """Kind of the point ``x``."""
     residual_norm: float
     """‖r‖₂ at ``x``."""
     optimality: float

@@ -50,7 +50,7 @@ def operator_code(name: str) -> int:
 
 
 def require_tolerances(tol_f: float, tol_x: float, max_steps: int) -> None:
-    """Raise ValueError if a tolerance is not positive, or ``max_steps`` is not at least 1."""
+    """Raise ValueError if a tolerance is not positive or ``max_steps`` is less than 1."""
     for name, value in (("tol_f", tol_f), ("tol_x", tol_x)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}: got {value}, must be positive and finite")
@@ -74,18 +74,18 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
         jacobian: Function that returns ∂r/∂x (m, n) for x (n,).
         x0: (n,) starting point.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
-        tol_f: Limit of max|r| at a root, and of ‖P r‖ / ‖r‖ at a minimum, where P projects onto the range of
+        tol_f: Limit on max|r| at a root, and on ‖P r‖ / ‖r‖ at a minimum, where P projects onto the range of
             J.
         tol_x: Maximum size of the last Newton correction, relative to max(1, max|x|).
-        max_steps: Maximum number of trial steps of all attempts together, including rejected steps.
+        max_steps: Maximum number of trial steps in all attempts together, including rejected steps.
 
     Returns:
         The best iterate, with its status and kind. CONVERGED means a root or, with more equations than
-        unknowns, an isolated minimum of ‖r‖; ``kind`` tells which. ILL_CONDITIONED means a point that the
+        unknowns, an isolated minimum of ‖r‖; ``kind`` says which. ILL_CONDITIONED means a point that the
         equations do not determine, or a minimum of a square system with r ≠ 0, where J is singular.
         INVALID_START means that there are fewer equations than unknowns, or that the residual or the Jacobian
-        is not finite at ``x0``. The test of a minimum evaluates at least 2 n Jacobians, which ``stats``
-        includes.
+        is not finite at ``x0``. The test for a minimum evaluates at least 2 n Jacobians, which are included
+        in ``stats``.
 
     Raises:
         ValueError: If an argument is out of range, or an argument or a returned array has the wrong shape. A

@@ -1,4 +1,4 @@
-"""Trust region ‖D s‖ ≤ radius of a step s: choice of the radius, and acceptance or rejection of the step.
+"""Trust region ‖D s‖ ≤ radius for a step s: choice of the radius, and acceptance or rejection of the step.
 
 A step is accepted only if it reduces ‖r‖ (Moré, The Levenberg-Marquardt algorithm, 1978).
 """
@@ -54,7 +54,7 @@ def slope_of(w: Work) -> float:
 
 @njit_part
 def measure_newton(w: Work) -> None:
-    """Update D and the length of the Newton step; in the first call, also set the initial radius.
+    """Update D and the length of the Newton step; on the first call, also set the initial radius.
 
     A negative LIMIT selects D = I and an initial radius of −LIMIT.
     """
@@ -80,7 +80,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error of the relative decrease in ‖r‖²."""
+    """Return the rounding error in the relative decrease in ‖r‖²."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -123,7 +123,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the actual with the predicted decrease in ‖r‖², and update the radius.
+    """Compare the actual and predicted decreases in ‖r‖² and update the radius.
 
     ``norm`` is ‖r‖ at the trial point. Returns ACCEPTED, REJECTED or a Status.
     """

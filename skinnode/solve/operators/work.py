@@ -1,9 +1,9 @@
-"""Workspace of a solve, and products with its Jacobian.
+"""Workspace for a solve, and products with its Jacobian.
 
 The symbols are those of the paper: the residual r (m,), its Jacobian J (m, n), which is stored transposed,
 and the Levenberg-Marquardt parameter lam. The trust region of a step s is ‖D s‖ ≤ radius. The diagonal of D
 is the running maximum of the column norms of J (Moré 1978), which makes the solve independent of the units of
-the unknowns. In the second and third attempt of ``solve_system``, D is the identity.
+the unknowns. In the second and third attempts of ``solve_system``, D is the identity.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Work(NamedTuple):
     scale: Annotated[Float, "n"]
     """Diagonal of D."""
     diagonal: Annotated[Float, "n"]
-    """Diagonal of R of the QR factorisation of J."""
+    """Diagonal of R in the QR factorisation of J."""
     beta: Annotated[Float, "n"]
-    """Factors β of the reflectors of Q of the QR factorisation."""
+    """Factors β of the reflectors of Q in the QR factorisation."""
     v: Annotated[Float, "n"]
     bd: Annotated[Float, "n"]
     """Diagonal of the bidiagonal form of J D⁻¹; its superdiagonal is ``bu``."""
@@ -52,7 +52,7 @@ class Work(NamedTuple):
     js: Annotated[Float, "m"]
     """J·step."""
     e: Annotated[Float, "m"]
-    """Scratch."""
+    """Work array."""
     jt: Annotated[Float, "n m"]
     """Jᵀ at x."""
     lu: Annotated[Float, "n+3 lanes_n"]
@@ -64,7 +64,7 @@ class Work(NamedTuple):
     left: Annotated[Float, "n lanes_n+3"]
     """Left reflectors of the bidiagonal form."""
     wide: Annotated[Float, "lanes_m"]
-    """Scratch; as long as a row of ``right``."""
+    """Work array, as long as a row of ``right``."""
     pivot: Annotated[Index, "n"]
     s: Annotated[Float, "scalars"]
     flag: Annotated[Index, "flags"]

@@ -1,7 +1,7 @@
-"""Corrector of a path tracker: solves wires at given positions on the path, and logs each call.
+"""Corrector of a path tracker: solves wires at given positions on the path and logs each call.
 
 A path position is a sample number, counted from 0; the patch at rest is at −1. Between samples, ``a``
-(R · gain) is interpolated linearly. Interpolating 1/a or log a instead solves about as many wires.
+(R · gain) is interpolated linearly. Interpolating 1/a or log a instead solves about the same number of wires.
 """
 
 from __future__ import annotations

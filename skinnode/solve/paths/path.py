@@ -1,7 +1,7 @@
 """Path following as in the paper: solves a recorded press sample by sample, up to the last sample.
 
-The path X(t) is the solution of H(X, t) = F(X) − ρ / R(t) = 0; X(0) is the grid at rest. The solution of each
-sample is the starting point for the next (Lahaye; Xu et al. 2018, section 3.2). Step control
+The path X(t) is the solution of H(X, t) = F(X) − ρ / R(t) = 0; X(0) is the grid at rest. The solution for
+each sample is the starting point for the next (Lahaye; Xu et al. 2018, section 3.2). Step control
 (:mod:`skinnode.solve.paths.step_control`) chooses which samples to solve, to what tolerance, and whether to
 solve points between samples.
 """
@@ -38,8 +38,8 @@ from skinnode.solve.wires.problem import PatchProblem
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
 """Accuracy of a solve that starts at the posterior estimate.
 
-The tolerance is the paper's for the last sample. The maximum number of steps is the paper's for all earlier
-samples.
+The tolerance is the paper's tolerance for the last sample. The maximum number of steps is the paper's limit
+for all earlier samples.
 """
 STARTS: Final = 12
 """Number of starting points in the search for other roots of F = b.
@@ -50,7 +50,7 @@ The starting points are random samples of the posterior; the random seed is fixe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathResult:
-    """Solution at the end of a path, and a log of the solver calls on the path.
+    """Solution at the end of a path and log of the solver calls on the path.
 
     The log consists of ``position``, ``steps``, ``evaluations`` and ``optimality``, with one row per solver
     call. For a wire that a call did not solve, the position and the optimality are NaN. Calls after the first
@@ -113,7 +113,7 @@ def solve_path(
         samples_ohm: (T, U, K) resistances, ohm, in time order; the last sample is the frame to solve.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
         schedule: Step control: ``Uniform()`` (default), ``Periodic()`` or ``Adaptive()``.
-        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors of resistivity and gain
+        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors in resistivity and gain
             cancel.
 
     Returns:
@@ -167,7 +167,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Select roots with the posterior; return the posterior estimate, or None if it is not trusted."""
+    """Select roots using the posterior; return the posterior estimate, or None if it is not trusted."""
     options = PosteriorOptions(
         relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False, contacts=False,
         follow_noise=False,

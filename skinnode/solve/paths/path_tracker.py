@@ -65,7 +65,7 @@ class PathEnd:
 
 
 class PathTracker:
-    """Tracker of the wires along the samples of one press; each press needs its own instance.
+    """Tracks the wires through the samples of one press; each press needs its own instance.
 
     Args:
         problem: The patch.
@@ -165,7 +165,7 @@ class PathTracker:
         self.end.doubt(self._crossed)
 
     def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
-        """Follow the wires in ``todo`` (U,) from rest along ``samples``, and store the ends of their paths.
+        """Follow the wires in ``todo`` (U,) from rest along ``samples`` and store the ends of their paths.
 
         ``samples`` contains sample numbers in time order and includes the last sample of the press. The
         positions of the wires and :attr:`end` do not change.
@@ -191,7 +191,7 @@ class PathTracker:
     # -- wire by wire ----------------------------------------------------------------------------------
 
     def predict(self, position: Float) -> Float:
-        """Predict x (U, n), pitches, at ``position`` (U,) from the last converged solve of each wire."""
+        """Predict x (U, n), in pitches, at ``position`` (U,) from the last converged solve of each wire."""
         solver = self.solver
         return euler(solver.x, solver.inverse, solver.a_solved, self.corrector.a_at(position))
 
@@ -222,7 +222,7 @@ class PathTracker:
         operator: int | None = None,
         also: Callable[[], Mask] | None = None,
     ) -> None:
-        """Solve the last sample for the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
+        """Solve the last sample for the wires in ``todo`` (U,) and store the outcome in :attr:`end`.
 
         Args:
             todo: (U,) mask of the wires to solve.
@@ -255,7 +255,7 @@ class PathTracker:
         )
 
     def at_path_end(self) -> Mask:
-        """Return a mask (U,) of the wires at the end of their path, if their displacement is plausible."""
+        """Return a mask (U,) of the wires at the end of their path with a plausible displacement."""
         apart = roots.distance(self.solver.x, self._path_end)
         size = roots.distance(self._path_end, self.problem.rest)
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())

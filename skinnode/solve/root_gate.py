@@ -1,10 +1,10 @@
-"""Checks of the roots found by the exact inverse; the posterior confirms, replaces or rejects them.
+"""Checks the roots found by the exact inverse; the posterior confirms, replaces or rejects them.
 
 A root is doubtful in three cases: an electrode moved too far since the previous frame, the displacement is
 too rough for a press, or a press can move the wire across a fold, where two roots of F = b merge. Near a
-fold, the exact inverse cannot tell which of two roots is the correct one. A wire without a root is doubtful
-too. The posterior, which estimates the positions from all wires of the patch, decides about each doubtful
-root. :mod:`skinnode.solve.roots` defines the thresholds.
+fold, the exact inverse cannot tell which of two roots is correct. A wire without a root is doubtful too. The
+posterior, which estimates the positions from all wires of the patch, decides on each doubtful root.
+:mod:`skinnode.solve.roots` defines the thresholds.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after one that missed its deadline.
+"""Number of frames without a posterior solve after a solve that missed its deadline.
 
 Without this pause, a posterior that misses every deadline would delay the other patches on the same thread by
 2 ms per frame.
 """
 APART: Final = 3.0
-"""Factor for the distance between a confirmed root and the posterior estimate, for wires that a press can
-move across a fold.
+"""Factor applied to the distance between a confirmed root and the posterior estimate, for wires that a press
+can move across a fold.
 
 The product is added in quadrature to the standard deviation of the root, because the posterior cannot
 distinguish two roots that are very close to each other.
 """
 NEAR_FOLD: Final = 2.0
-"""Factor for the standard deviation of a posterior estimate that replaces a root, for wires that a press can
-move across a fold."""
+"""Factor applied to the standard deviation of a posterior estimate that replaces a root, for wires that a
+press can move across a fold."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Check of the fields of an exact tracker against the posterior estimate of the same patch.
+    """Checks the fields of an exact tracker against the posterior estimate of the same patch.
 
     Each exact tracker needs its own gate.
 
@@ -124,7 +124,8 @@ class RootGate:
         Args:
             field: Field of the exact tracker.
             start: Start of the tracker's update, on the clock :func:`skinnode.process.clock.perf_counter`, s.
-            again: True if this frame was already checked, and was then solved again without some readings.
+            again: True if this frame has already been checked and was then solved again without some
+                readings.
         """
         doubtful: Mask | None = None
         self.hurried = False
@@ -185,7 +186,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Reject all doubtful roots, for lack of time for a posterior solve."""
+        """Reject all doubtful roots, because there is no time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0

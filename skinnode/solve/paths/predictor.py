@@ -1,4 +1,4 @@
-"""Predictors of a path tracker: estimates of the next point on a path from the points already solved."""
+"""Predictors for a path tracker: estimate the next point on a path from points already solved."""
 
 from __future__ import annotations
 

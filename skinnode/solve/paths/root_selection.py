@@ -26,10 +26,10 @@ from skinnode.solve.wires import arrays as wires
 GUIDED_STEPS: Final = 100
 """Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`).
 
-Starts near a root take 1 to 20 steps. Other starts do not converge.
+Solves that start near a root take 1 to 20 steps. Others do not converge.
 """
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of roots that are only compared with other roots, which differ by much more than the tolerance."""
+"""Accuracy of roots that are only compared with other roots; distinct roots differ by far more than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,9 +54,9 @@ def doubtful(tracker: PathTracker) -> Mask:
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again, starting at the smoothest displacement that explains it.
 
-    If the new root is across a fold, its twin on the same side as the rest position is used instead. Of a
-    wire's old and new solution, the one with the smoother displacement is kept. If no new root is found, the
-    wire is not CONVERGED, even if it was before.
+    If the new root is across a fold, its twin on the same side as the rest position is used instead. Each
+    wire keeps whichever of its old and new solutions has the smoother displacement. If no new root is found,
+    the wire is not CONVERGED, even if it was previously.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -204,9 +204,9 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
     """Reject roots that differ from the end of a smooth path, and move these wires back to the path's end.
 
     If the skin itself has crossed a fold, a wrong root on the near side can be smoother and likelier than the
-    correct root. Then :func:`guide` and the posterior find the wrong root, and only the path leads to the
-    correct one. If any root is rejected for this reason, so is every other root that is not at the end of its
-    path.
+    correct root. In that case, :func:`guide` and the posterior find the wrong root, and only the path leads
+    to the correct root. If any root is rejected for this reason, so is every other root that is not at the
+    end of its path.
     """
     if not tracker.second_tries:
         return  # the wires have not left the ends of their paths
@@ -218,7 +218,7 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
 
 
 def _twins(tracker: PathTracker) -> Float:
-    """Return estimated positions (U, n) of the twins of all roots; NaN for wires that are not CONVERGED."""
+    """Return the estimated twins (U, n) of all roots; NaN for wires that are not CONVERGED."""
     x, end, last_a = tracker.solver.x, tracker.end, tracker.last_a
     twins = np.full_like(x, math.nan)
     for u in np.flatnonzero(end.converged).tolist():

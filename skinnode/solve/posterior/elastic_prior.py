@@ -1,7 +1,7 @@
-"""Elastic prior: the displacement of the rubber expected before any resistance is measured.
+"""Elastic prior: the rubber displacement expected before any resistance is measured.
 
 Each electrode is at the centre of a cell one pitch wide. Independent loads on the surfaces of the cells
-displace the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
+displace the electrodes according to the response G of an elastic half-space (Boussinesq, Cerruti;
 :func:`skinnode.model.elastic.rectangle_compliance`). The prior of the displacement u is
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
@@ -28,9 +28,9 @@ from skinnode.solve.linalg.cholesky import multiply
 from skinnode.solve.posterior.load_cells import MARGIN, LoadCells
 
 SHEAR_SHARE: Final = 0.4
-"""Ratio of expected shear loads to expected normal loads (standard deviations). The marginal likelihood of
-the data hardly changes between 0.25 and 0.4. With smaller values, the standard deviations are too small on
-layouts that are insensitive to shear (`aligned`)."""
+"""Ratio of the standard deviation of shear loads to that of normal loads. The marginal likelihood of the data
+hardly changes between 0.25 and 0.4. With smaller values, the standard deviations are too small on layouts
+that are insensitive to shear (`aligned`)."""
 LAYER_SHARE: Final = 0.25
 """Size of the displacements that the data check expects on a bonded layer, relative to those on a half-space.
 With 0.1, a dent in a thin layer is mistaken for a faulty wire. With 0.5, delayed readings of an upper wire
@@ -96,7 +96,7 @@ class ElasticPrior:
         return index[MARGIN : self.shape[0] - MARGIN, MARGIN : self.shape[1] - MARGIN]
 
 
-@functools.lru_cache(maxsize=8)  # for the reference patch, 30 ms and 2 MB
+@functools.lru_cache(maxsize=8)  # each prior of the reference patch takes 30 ms and 2 MB
 def _elastic_prior(layout: PatchLayout, rubber: Rubber) -> ElasticPrior:
     return ElasticPrior.compute(layout, rubber)
 

@@ -1,4 +1,4 @@
-"""Geometry errors: the manufacturing errors of a patch, estimated as nuisances.
+"""Geometry errors: the manufacturing errors of a patch, estimated as nuisance parameters.
 
 The resistances at rest (R₀) are measured, so a geometry error θ has no effect on the residuals at rest. Away
 from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest. The effect grows with
@@ -45,9 +45,9 @@ LOWER: Final = 3
 EFFECTS: Final = COMMON + UPPER + LOWER
 """Number of geometry nuisances that affect each residual."""
 GAIN_SHARE: Final = math.sqrt(0.5)
-"""Standard deviation of each of the two parts of a gain error, in tolerances. The first part is common to all
-wires and models a shared converter. The second part is independent for each upper wire and models a converter
-per wire."""
+"""Standard deviation of each of the two parts of a gain error, in units of the tolerance. The first part is
+common to all wires and models a shared converter. The second part is independent for each upper wire and
+models one converter per wire."""
 
 
 def nuisances(wires: int, equations: int) -> int:

@@ -34,7 +34,7 @@ class LoadCells:
     height_m: float
     """Median height of the electrodes above the lower layer, m."""
     size_m: tuple[float, float]
-    """Lengths of a cell along and across the wires, m."""
+    """Size of a cell along and across the wires, in m."""
     shape: tuple[int, int]
     """Number of cells across and along the wires; their product is Q."""
 
@@ -91,7 +91,7 @@ def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire with one electrode has no direction; derive one
+    else:  # a wire with one electrode has no direction; derive it
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:
@@ -118,7 +118,7 @@ def _sized(direction: Float, length: float) -> Float:
 def _carried_on(
     fields: tuple[Float, Float, Float, Float], axis: int, step: Float
 ) -> tuple[Float, Float, Float, Float]:
-    """Add :data:`MARGIN` rows at each end of ``axis``; extrapolate sites, repeat steps and normals."""
+    """Add :data:`MARGIN` rows at each end of ``axis``: extrapolated sites, repeated steps and normals."""
     pad = [(MARGIN, MARGIN) if i == axis else (0, 0) for i in range(3)]
     site, along, across, normal = fields
     along, across, normal = (np.pad(field, pad, mode="edge") for field in (along, across, normal))

@@ -1,7 +1,7 @@
 """Prior of the loads on a patch, and of the displacement that they cause.
 
 The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
-the prior expects loads mainly at the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
+the prior expects loads mainly in the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
 where they were found (:meth:`LoadPrior.localise`). The skin next to a contact is then estimated to move only
 as far as the contact's loads require. In tests, expecting loads where they were found reduced displacement
 errors by a factor of two to three.
@@ -27,7 +27,7 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 PRIOR_DOUBT: Final = 3.0
-"""Factor applied to the part of the variance that depends on the prior; accounts for the uncertainty of the
+"""Factor applied to the part of the variance that depends on the prior; accounts for the uncertainty in the
 expected loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement
 errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
 SMOOTH_SHARE: Final = 0.25
@@ -35,19 +35,20 @@ SMOOTH_SHARE: Final = 0.25
 less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
 displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 DISC_SLACK: Final = 0.07
-"""Standard deviation of the displacement that loads in discs do not explain, independent at each electrode,
-relative to the displacement expected there. With 0, an error exceeded five standard deviations in one of ten
-dents; with 0.1, in none of 30."""
+"""Standard deviation of the part of the displacement not explained by loads in discs, relative to the
+expected displacement; independent for each electrode. With 0, an error exceeded five standard deviations in
+one of ten dents; with 0.1, in none of 30."""
 DISC_DOUBT: Final = 2.5
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
 DISC_SHARE: Final = 0.8
 """Value of :data:`SMOOTH_SHARE` for a prior with discs."""
 DISC_FAINT: Final = 0.05
-"""Load variance that discs add to a cell, relative to that of untouched skin, below which it is neglected."""
+"""Limit below which the load variance that discs add to a cell is neglected, relative to the variance on
+untouched skin."""
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation of the Gaussian that spreads squared loads over neighbouring cells, in cells. A smaller
-value improves the displacement if the rubber behaves like a half-space; otherwise, the standard deviations
-become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
+value improves the displacement estimate if the rubber behaves like a half-space; otherwise, the standard
+deviations become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells where no load was found, relative to the mean over the patch. A positive
 value accounts for light touches near a press."""
@@ -56,9 +57,9 @@ LOCAL_CHANGE: Final = 0.35
 displacement errors reached 6 standard deviations with a fraction of 0.5. With 0.25, the prior was rebuilt
 twice as often."""
 LOCAL_SURPRISE: Final = 16.0
-"""Ratio of the squared load to the expected squared load of a cell, above which the prior is rebuilt even if
-the load locations have hardly changed. Without this limit, displacement errors reached 7 standard deviations
-when the depth of a press doubled in one frame."""
+"""Ratio of a cell's squared load to its expected squared load, above which the prior is rebuilt even if the
+load locations have hardly changed. Without this limit, displacement errors reached 7 standard deviations when
+the depth of a press doubled in one frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +73,17 @@ class UniformPrior:
     covariance: Float
     """(U f, U f) matrix C, pitch²."""
     root: Float
-    """(U f, U f) array with the Cholesky factor of C."""
+    """(U f, U f) array containing the Cholesky factor of C."""
     blur: Float
     """(Q, Q) weights of a Gaussian blur over the cells."""
 
     @classmethod
     def of(cls, elastic: ElasticPrior, free: Index) -> UniformPrior:
-        """Return the prior of the coordinates ``free`` (U f,) from a cache; computed on first use."""
+        """Return the cached prior of the coordinates ``free`` (U f,), computing it on first use."""
         return _uniform_prior(elastic, free.tobytes())
 
 
-@functools.lru_cache(maxsize=8)  # for the reference patch, 4 MB
+@functools.lru_cache(maxsize=8)  # 4 MB for the reference patch
 def _uniform_prior(elastic: ElasticPrior, free_bytes: bytes) -> UniformPrior:
     free = np.frombuffer(free_bytes, np.int64)
     every = free.size == len(elastic.response)
@@ -184,9 +185,9 @@ class LoadPrior:
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
         """Return the load variances (Q,) for the next solve, in pitch².
 
-        Each variance moves halfway from its current value to the value for the loads found. With full steps,
-        the variances of neighbouring cells would oscillate. A full step is taken only from equal expected
-        loads, and only if a press is certain.
+        Each variance moves halfway from its current value to the value indicated by the loads found. With
+        full steps, the variances of neighbouring cells would oscillate. A full step is taken only from equal
+        expected loads, and only if a press is certain.
 
         Args:
             found: (Q,) squared loads found in the frame, pitch².

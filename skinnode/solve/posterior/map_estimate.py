@@ -67,11 +67,11 @@ EFFECT_STEP: Final = 0.2
 """Relative change in the effects of the geometry errors (root sum of squares) above which the factors are
 recomputed. Below this limit, the standard deviations change by less than 20 %."""
 HALVINGS: Final = 6
-"""Maximum number of times that a Gauss-Newton step is halved."""
+"""Maximum number of times a Gauss-Newton step is halved."""
 
 
 class MapEstimator:
-    """MAP estimator of one patch, with its displacement, nuisances and last factors.
+    """MAP estimator of one patch; holds the displacement, the nuisances and the last factors.
 
     Each stream needs its own instance.
 
@@ -93,8 +93,8 @@ class MapEstimator:
         factors: Serial number of the current factors.
         evaluations: Number of evaluations of F and its Jacobian, per wire. The caller resets the counter.
         factorisations: Number of factorisations. The caller resets the counter.
-        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A solve that exceeds the
-            deadline raises TimeoutError.
+        until: Deadline on the clock :func:`skinnode.process.clock.perf_counter`, in s. A solve that exceeds
+            the deadline raises TimeoutError.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class MapEstimator:
     def reset(self, scale2: float) -> None:
         """Return to rest, and expect equal loads everywhere with s² = ``scale2`` in pitch².
 
-        The memory of the factors is freed, so that a hand needs memory only for the patches in contact.
+        The factors' memory is freed, so that a hand needs memory only for the patches in contact.
         """
         self.moved[:] = 0.0
         self.g[:] = 0.0
@@ -232,7 +232,7 @@ class MapEstimator:
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None stands for rest."""
+        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None means at rest."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:

@@ -3,7 +3,7 @@
 The update works in data space, like the measurement update of a Kalman filter.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
-g ~ N(0, diag(d)). A wire has the residual r = w (a F(x) − 1) with w = 1/σ. The model is
+g ~ N(0, diag(d)). Each wire has the residual r = w (a F(x) − 1) with w = 1/σ. The model is
 
     r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
@@ -54,7 +54,7 @@ from skinnode.solve.posterior.geometry_error import add_effect, effect_on
 
 
 class Buffers(NamedTuple):
-    """Arrays that a Gauss-Newton step writes, for one patch.
+    """Arrays written by a Gauss-Newton step, for one patch.
 
     Each of the U wires has K equations and f free coordinates; there are p nuisances. A reduced wire has R =
     min(K, f + p) rows. With geometry errors, R = K. The large arrays of the factors (``cross_covariance``,
@@ -105,7 +105,7 @@ class Buffers(NamedTuple):
 def make_buffers(  # noqa: PLR0913 - the sizes of a patch
     wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
 ) -> Buffers:
-    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are for one wire."""
+    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are per wire."""
     columns = free + nuisances
     rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
@@ -127,7 +127,7 @@ def with_factors(b: Buffers) -> Buffers:
 
 
 def without_factors(b: Buffers) -> Buffers:
-    """Return the buffers with empty arrays instead of the factors. No kernel may use them."""
+    """Return the buffers with empty arrays instead of the factors. Kernels must not use them."""
     return _resized(b, 0)
 
 

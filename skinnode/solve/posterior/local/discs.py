@@ -54,7 +54,7 @@ SWEEPS: Final = 3
 """Maximum number of sweeps over all parameters. After a sweep without an improvement, the steps are
 halved."""
 WORTH: Final = 0.05
-"""Minimum gain in log-likelihood for a step to be taken."""
+"""Minimum gain in log-likelihood for a step to be accepted."""
 PARAMETERS: Final = 5
 """Number of parameters of a disc: row, column, ln R, ln a, ln β."""
 LOADS: Final = 4

@@ -24,7 +24,7 @@ ROUGH_SHARE: Final = 1e-3
 
 
 class Smoothness:
-    """Smoothness model of every upper wire of a patch.
+    """Smoothness model for every upper wire of a patch.
 
     Args:
         problem: The patch.

@@ -1,4 +1,4 @@
-"""Template of all HTML pages, and escaping of untrusted text in them."""
+"""Template for all HTML pages, and a function that escapes untrusted text in them."""
 
 from __future__ import annotations
 

@@ -6,12 +6,12 @@ Text from a device, a file, a recording or the command line is untrusted. It is 
   ``od --json``, DCF files and comparisons use the original bytes.
 * ``skinnode.config`` rejects names in hand.toml that are not printable.
 * All output of commands passes through :class:`PrintableStream` or, for output by rich, through the console
-  of ``skinnode.cli``. This covers file names and arguments, too.
+  of ``skinnode.cli``. This includes file names and arguments.
 * In HTML pages, the special characters of HTML are escaped as well.
 
 :meth:`str.isprintable` defines which characters are printable. Control characters, surrogates and format
-characters, such as those that reverse the text direction, are not. They are replaced with Python escape
-sequences such as ``\x1b`` and ``\u202e``.
+characters, such as those that reverse the text direction, are not printable. They are replaced with Python
+escape sequences such as ``\x1b`` and ``\u202e``.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """Wrapper of a text stream, such as stdout, that escapes non-printable characters.
+    """Wrapper around a text stream, such as stdout, that escapes non-printable characters.
 
     Rich bypasses the wrapper: it writes to the stream in the attribute ``rich_proxied_file``.
     """

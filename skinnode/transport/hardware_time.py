@@ -15,7 +15,7 @@ DRIFT: Final = 200e-6
 class HardwareClock:
     """Converts a CAN controller's hardware timestamps to the monotonic clock. Only one thread may use it.
 
-    The kernel may timestamp a frame late, but never early. The difference between a frame's kernel timestamp
+    The kernel can timestamp a frame late, but never early. The difference between a frame's kernel timestamp
     and its hardware timestamp is therefore an upper bound on the offset between the two clocks. The estimated
     offset follows the lowest bounds and rises no faster than two clocks can drift apart.
     """

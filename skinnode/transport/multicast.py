@@ -8,10 +8,10 @@ converts each kind of frame only once:
 - To send a frame, its data is inserted into a packet that python-can has packed for this identifier and
   length.
 - A received packet is compared, without its timestamp and data, with the packets that python-can has already
-  unpacked. If the packet differs from all of these or has another layout, python-can unpacks it.
+  unpacked. If the packet differs from all of these or has a different layout, python-can unpacks it.
 
-Like python-can's interface, this one has no arbitration and does not guarantee delivery or order: it is meant
-for tests of programs, not of a bus under load.
+Like python-can's interface, this interface has no arbitration and does not guarantee delivery or order: it is
+meant for tests of programs, not of a bus under load.
 
 Packets are received in batches, with kernel timestamps and the kernel's drop counter. A sender also receives
 its own packets. The sender skips these packets, which it identifies by a tag in the channel field. python-can
@@ -44,11 +44,11 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _DELIVERY_S: Final = 0.05
-"""Maximum time (s) that the kernel needs to deliver a frame. The longest time observed was 28 ms."""
+"""Maximum time (s) for the kernel to deliver a frame. The longest time observed was 28 ms."""
 
 _BATCH_PACKETS: Final = 256
 _PACKET_BYTES: Final = 4096
-"""Maximum packet length, bytes, as in python-can. Longer packets are truncated."""
+"""Maximum packet length in bytes, as in python-can. Longer packets are truncated."""
 
 _STAMP: Final = struct.Struct("@qq")  # struct timespec: s and ns
 _DROPS: Final = struct.Struct("@I")
@@ -57,7 +57,7 @@ _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMP.size)
 _COUNTED_BYTES: Final = _STAMPED_BYTES + socket.CMSG_SPACE(_DROPS.size)
 _HEAD: Final = b"\x8b\xa9timestamp\xcb"  # a map with 11 entries, the first of which is a 64-bit float
 _HEAD_BYTES: Final = len(_HEAD) + 8
-"""Length of a packet's head up to the end of the timestamp, bytes."""
+"""Length of a packet up to the end of the timestamp, in bytes."""
 _DATA: Final = b"\xa4data\xc4"  # data key and byte-string type; followed by the length (u8)
 
 
@@ -97,7 +97,7 @@ class _Kind(NamedTuple):
 
 
 class MulticastSocket:
-    """Endpoint on a multicast group. Any thread may send, but only one thread may receive.
+    """Endpoint in a multicast group. Any thread may send, but only one thread may receive.
 
     Args:
         bus: Open python-can bus. The endpoint takes over its socket and shuts the bus down.

@@ -37,7 +37,7 @@ LONG_NS: Final = 5_000_000
 by up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which the preceding frames are fetched, ns, so that the predicted frame
+"""Time (ns) before a predicted arrival at which the preceding frames are fetched, so that the predicted frame
 itself is fetched without delay."""
 _SHORT_NS: Final = 300_000
 """Minimum pause (ns) between batches of frames; used around a predicted arrival."""
@@ -73,7 +73,7 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time (ns) until which all received frames have been queued or dropped."""
+        """Monotonic time (ns) up to which all received frames have been queued or dropped."""
         self.due_ns = 0
         """Monotonic time (ns) of the next :meth:`fetch`."""
         self._capacity = capacity
@@ -104,7 +104,7 @@ class Intake:
 
         Raises:
             BusError: if the bus has failed and the queue is empty.
-            Exception: any other exception of the port, if the queue is empty.
+            Exception: any other exception raised by the port, if the queue is empty.
         """
         # Read the error first, so that no frame received before the error is missed.
         error, batches = self._error, self._queue
@@ -123,7 +123,8 @@ class Intake:
 
         Args:
             what: Name of the group. A new prediction replaces the previous one.
-            times_ns: Possible arrival times on the monotonic clock, ns, ascending; empty if unknown.
+            times_ns: Possible arrival times on the monotonic clock, in ns and in ascending order; empty if
+                unknown.
         """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
@@ -197,7 +198,7 @@ class Intake:
 
 @dataclass(slots=True)
 class _Shared:
-    """State of the receiving thread that several ports share."""
+    """State of the receiving thread shared by several ports."""
 
     intakes: dict[Intake, None]
     """Intakes as keys, in the order in which they were added."""
@@ -209,7 +210,7 @@ class Receiver(Closing):
 
     All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Ports that announce
     their frames (timed) are read in :meth:`wait`, without a thread. Each other port has its own thread,
-    because receiving with python-can may block. If a port fails, reception from the other ports continues.
+    because receiving with python-can can block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill, one per port.
@@ -257,7 +258,7 @@ class Receiver(Closing):
             intake.resume()
             self._signalled[intake] = None
             signalling.call_on_arrival(functools.partial(self._on_signal, intake))
-            self._on_signal(intake)  # frames may have arrived before
+            self._on_signal(intake)  # frames may already have arrived
             return
         if intake in self._alone:
             # The error makes the old thread end, so it must not be cleared earlier.
@@ -281,7 +282,7 @@ class Receiver(Closing):
         self._notify()
 
     def _fetch_signalled(self) -> None:
-        """Fetch the announced frames. Every :data:`_POLL_S`, fetch from all ports.
+        """Fetch the announced frames. Fetch from all ports every :data:`_POLL_S`.
 
         This detects a failed port, and updates :attr:`Intake.seen_ns` of a port without frames.
         """

@@ -35,7 +35,7 @@ _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
-_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # length of ancillary data with timestamps only
+_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # length of ancillary data, timestamps only
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
 """Usual layout of a received frame in memory: identifier, length, 8 data bytes, software and hardware
 timestamps."""
@@ -43,7 +43,7 @@ timestamps."""
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible time (ns) by which a timestamp is later than the reading of its frame."""
+"""Maximum plausible lead (ns) of a frame's timestamp over the time at which the frame is read."""
 
 _IP_S: Final = 5.0
 """Maximum duration (s) of an ``ip link`` command."""
@@ -146,7 +146,7 @@ class SocketReader:
 
 
 def set_link_bitrate(config: BusConfig) -> None:
-    """Set the bit rates of a CAN interface with ``ip link``. The interface is down in the meantime.
+    """Set the bit rates of a CAN interface with ``ip link``. The interface is down during the change.
 
     Raises:
         BusError: if ``ip link`` fails. The message contains its error output.

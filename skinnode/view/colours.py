@@ -35,7 +35,7 @@ def depth_rgba(depth_m: Float, unknown: NDArray[np.bool_], full_m: float) -> NDA
 
 
 def grey_rgba(points: int) -> NDArray[np.uint8]:
-    """Return the (``points``, 4) colours of a surface without a known and current displacement."""
+    """Return the (``points``, 4) colours of a surface whose displacement is unknown or out of date."""
     made = np.full((points, 4), 255, np.uint8)
     made[:, :3] = UNKNOWN_RGB
     return made

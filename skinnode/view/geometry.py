@@ -65,7 +65,7 @@ def normals(surface_m: Float) -> Float:
 
 
 def displaced_m(rest_m: Float, displacement_m: Float, exaggeration: float) -> Float:
-    """Return the (U, N, 3) surface, m, with exaggerated displacement; unknown displacements count as zero.
+    """Return the (U, N, 3) surface in m with exaggerated displacement; unknown displacements count as zero.
 
     Args:
         rest_m: (U, N, 3) positions of the electrodes at rest, m.
@@ -76,7 +76,7 @@ def displaced_m(rest_m: Float, displacement_m: Float, exaggeration: float) -> Fl
 
 
 def edge_m(surface_m: Float) -> Float:
-    """Return a surface's edge as a closed (P, 3) line, m, counter-clockwise as seen from outside the skin.
+    """Return a surface's edge as a closed (P, 3) line in m, counter-clockwise as seen from outside the skin.
 
     Args:
         surface_m: (U, N, 3) points, m.
@@ -87,7 +87,7 @@ def edge_m(surface_m: Float) -> Float:
 
 
 def ring_m(contact: Contact, lift_m: float) -> Float:
-    """Return a closed (:data:`RING_POINTS`, 3) circle, m, with the same area as a contact.
+    """Return a closed (:data:`RING_POINTS`, 3) circle in m with the same area as a contact.
 
     Args:
         contact: Contact in patch coordinates.
@@ -101,7 +101,7 @@ def ring_m(contact: Contact, lift_m: float) -> Float:
 
 
 def force_n(contact: Contact) -> Float:
-    """Return a contact's (3,) force on the skin, N, in patch coordinates.
+    """Return a contact's (3,) force on the skin, in N and in patch coordinates.
 
     Args:
         contact: Contact; a positive normal force points into the skin.

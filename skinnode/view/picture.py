@@ -17,8 +17,8 @@ from skinnode.view.geometry import displaced_m, force_n, normals, ring_m
 FORCE_M_PER_N: Final = 0.012
 """Arrow length for a force of 1 N, m."""
 SHEAR: Final = 4.0
-"""Extra magnification of shear arrows relative to the surface, as on the monitor's maps: shear is about a
-quarter of the depth."""
+"""Extra magnification of shear arrows relative to the surface, as on the monitor's maps, because shear is
+about a quarter of the depth."""
 _SHORT: Final = 0.05
 """Minimum shear drawn as an arrow, as a fraction of the depth shown in the brightest colour."""
 _LIFT: Final = 0.05
@@ -137,7 +137,7 @@ def _certain_shear(field: FieldFrame, full_m: float) -> NDArray[np.bool_]:
 
 
 def _centre_m(centroid_m: Float, rest_m: Float, moved_m: Float) -> Float:
-    """Return the drawn (3,) centre of a contact, m, displaced like the nearest electrode."""
+    """Return the drawn (3,) centre of a contact in m, displaced like the nearest electrode."""
     distances = np.linalg.norm(rest_m - centroid_m, axis=-1)
     nearest = np.unravel_index(int(distances.argmin()), distances.shape)
     return np.asarray(centroid_m + moved_m[nearest] - rest_m[nearest])

@@ -96,7 +96,7 @@ class ElasticPrior:
         return index[MARGIN : self.shape[0] - MARGIN, MARGIN : self.shape[1] - MARGIN]
 
 
-@functools.lru_cache(maxsize=8)  # each prior of the reference patch takes 30 ms and 2 MB
+@functools.lru_cache(maxsize=8)  # for the reference patch, 30 ms and 2 MB
 def _elastic_prior(layout: PatchLayout, rubber: Rubber) -> ElasticPrior:
     return ElasticPrior.compute(layout, rubber)
 

@@ -83,7 +83,7 @@ class UniformPrior:
         return _uniform_prior(elastic, free.tobytes())
 
 
-@functools.lru_cache(maxsize=8)  # 4 MB for the reference patch
+@functools.lru_cache(maxsize=8)  # for the reference patch, 4 MB
 def _uniform_prior(elastic: ElasticPrior, free_bytes: bytes) -> UniformPrior:
     free = np.frombuffer(free_bytes, np.int64)
     every = free.size == len(elastic.response)

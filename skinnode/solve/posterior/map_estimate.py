@@ -342,7 +342,7 @@ class MapEstimator:
         return self._gamma
 
     def evidence_scale(self, weight: float, scale2: float) -> float:
-        """Return the next s², in pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
+        """Return s², in pitch², after one more MacKay iteration (Neural Computation 4, 415, 1992).
 
         Args:
             weight: Weight of the prior on s², as an equivalent number of parameters.
@@ -362,7 +362,7 @@ class MapEstimator:
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Return whether the current factors are valid for the given wires and noise, and for the prior."""
+        """Return whether the current factors are valid for the given wires, the noise and the prior."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored

@@ -1,6 +1,6 @@
 """Compiled corrector: solves r = w (a F − 1) = 0 for one wire by Newton-like iteration.
 
-The unknowns are coordinates of the wire's electrodes. Some electrodes may be fixed at rest, and x and y may
+The unknowns are coordinates of the wire's electrodes. Some electrodes can be fixed at rest, and x and y can
 be fixed (``normal_only``). A system with more equations than unknowns is called tall.
 
 The solution of a tall system minimises χ² = Σ (ρ_k/σ_k)². Here ρ_k = a_k F_k − 1 is the relative residual,

@@ -50,8 +50,8 @@ def decode(frame: FrameArrays) -> int:
 def scale(frame: FrameArrays, sigma: float) -> float:
     """Compute ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns the smallest relative standard deviation of the frame's resistances, or ``sigma`` if all of them
-    are unknown.
+    Returns the smallest relative standard deviation of the frame's resistances, or ``sigma`` if none is
+    known.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

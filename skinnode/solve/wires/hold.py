@@ -35,8 +35,8 @@ solved again."""
 def chi2_quantile(dof: float, z: float) -> float:
     """Return the χ² quantile for the probability of the standard normal quantile ``z``.
 
-    The approximation is that of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more
-    degrees of freedom. At very high probabilities, it never underestimates the quantile.
+    Uses the approximation of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more degrees
+    of freedom. At very high probabilities, it never underestimates the quantile.
 
     Args:
         dof: Degrees of freedom, greater than 0.
@@ -58,7 +58,7 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
     """Return the RMS of w ρ and compute ``std`` (n,) if the wire can be held; otherwise return −1.
 
     ``noise`` (K,) is the noise variance of the frame for which x was solved. ``rho``, ``variance`` and
-    ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
+    ``before`` (K,) are work arrays. The variance of a held coordinate is the largest of three values: the
     variance due to ``noise``, the variance due to the noise of the current frame, and the squared correction
     minus both variances.
     """

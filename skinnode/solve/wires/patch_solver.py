@@ -50,7 +50,7 @@ INCOMPLETE: Final = 2
 """A new trusted solution was stored in which the weight of some equation was 0."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance of the solve at the rest position, where the residual consists of rounding errors only."""
+"""Tolerance of the solve at the rest position, where the residual consists only of rounding errors."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -119,11 +119,11 @@ class PatchSolver:
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Numbers of evaluations of F, evaluations of J, and steps since the array was last set to 0."""
+        """Numbers of F evaluations, J evaluations and steps since the array was last set to 0."""
         self.turn = np.zeros(1, np.int64)
         """(1,) frame number, which SCALE increments.
 
-        The frame number determines the wires that compute a new inverse despite REUSE.
+        The frame number determines which wires compute a new inverse despite REUSE.
         """
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviations of the coordinates that are not unknowns, pitches."""
@@ -156,7 +156,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Compute J⁻¹ at the rest position; return the signs of det J (U,), 0 if J is not square."""
+        """Compute J⁻¹ at the rest position; return the signs (U,) of det J, or 0 if J is not square."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)

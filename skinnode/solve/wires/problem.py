@@ -1,8 +1,8 @@
 """Dimensionless equations of a patch: one system of equations per upper wire.
 
 Lengths are in pitches. The residuals are r_k = w_k (a_k F_k − 1). The scaled resistances are
-a_k = R_k / (R₀ F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ was measured, errors of the
-resistivity and of the front end's gain cancel; otherwise, R₀ F₀ is computed from the resistivity of the
+a_k = R_k / (R₀ F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ was measured, errors in the
+resistivity and in the front end's gain cancel; otherwise, R₀ F₀ is computed from the resistivity of the
 layout. With the weights w_k = σ_min / σ_k, the least-squares solution minimises χ². An equation with weight 0
 is ignored.
 """
@@ -38,7 +38,7 @@ class PatchProblem:
     lower: Float
     """(3, M, K) positions of the lower electrodes, pitches."""
     gain: Float
-    """(U, K) factors 1 / (R₀ F₀) that convert resistances in ohm to scaled resistances."""
+    """(U, K) factors 1 / (R₀ F₀) that convert resistances in ohms to scaled resistances."""
     a_rest: Float
     """(U, K) scaled resistances at rest, 1 / F₀."""
     share_at_rest: Float
@@ -52,7 +52,7 @@ class PatchProblem:
 
         Args:
             layout: The patch.
-            baseline_ohm: (U, K) resistances measured at rest, ohm; by default, they are computed from the
+            baseline_ohm: (U, K) resistances measured at rest, in ohms; by default, they are computed from the
                 resistivity of the layout.
 
         Raises:
@@ -83,7 +83,7 @@ class PatchProblem:
         """Return a mask (U,) of the wires with an electrode farther from rest than its clearance.
 
         Such a displacement is implausible. The test rejects the roots that arise from the symmetries of F,
-        which does not change if an electrode is mirrored at the lower layer or if two electrodes of a wire
+        which does not change if an electrode is reflected in the lower layer or if two electrodes of a wire
         are exchanged.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)

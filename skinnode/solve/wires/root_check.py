@@ -46,7 +46,7 @@ class RootCheck(ArrayTable):
     far_m: float
     pitch_m: float
     rough_limit: float
-    """Limit of a displacement's roughness divided by its Euclidean norm in pitches."""
+    """Limit on a displacement's roughness divided by its Euclidean norm in pitches."""
 
 
 _read = reader(RootCheck)

@@ -208,8 +208,8 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
         weight: (U, K) weights of the equations; an equation with weight 0 is ignored.
         order: (U,) indices of the wires, in the order in which to solve them.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-        units: Time limit, in units of one evaluation of F and J plus one step. The call returns before a wire
-            whose solve could exceed the limit.
+        units: Time limit, in units of one evaluation of F and J plus one step. The call returns before
+            starting a wire whose solve could exceed the limit.
 
     Returns the estimated time spent, in the same unit as ``units``. A wire with fewer usable equations than
     unknowns is not solved; its status is NON_FINITE if a value of ``a`` is out of range, otherwise

@@ -69,8 +69,8 @@ class RootGate:
         self._pause = 0  # remaining number of frames without a posterior solve
         self.hurried = False
         """Whether the last call of :meth:`check` had too little time to check all doubtful roots."""
-        self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, m
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # addition to the standard deviation, m; see APART
+        self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, in m
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # added to the standard deviation, in m; see APART
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._options = options
@@ -123,7 +123,8 @@ class RootGate:
 
         Args:
             field: Field of the exact tracker.
-            start: Start of the tracker's update, on the clock :func:`skinnode.process.clock.perf_counter`, s.
+            start: Start time of the tracker's update, in s, on the clock
+                :func:`skinnode.process.clock.perf_counter`.
             again: True if this frame has already been checked and was then solved again without some
                 readings.
         """

@@ -233,8 +233,8 @@ def rough_at_path_end(roughness: Float, displacement: Float, step_limit: float) 
 
     Args:
         roughness: (U,) roughness √(uᵀ C⁻¹ u) of each displacement u.
-        displacement: (U, n) displacements, pitches.
-        step_limit: Standard deviation of each coordinate according to C, pitches.
+        displacement: (U, n) displacements, in pitches.
+        step_limit: Standard deviation of each coordinate according to C, in pitches.
     """
     size = np.sqrt((displacement**2).sum(axis=1)) / step_limit
     return np.asarray(roughness > ROUGH_AT_PATH_END * size)

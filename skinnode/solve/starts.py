@@ -43,7 +43,7 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         problem: The patch.
         wire: Index of the upper wire.
         a: (K,) scaled resistances R · gain of the wire.
-        covariance: (n, n) prior covariance of the displacement of the wire, pitches².
+        covariance: (n, n) prior covariance of the displacement of the wire, in pitch².
 
     Returns:
         The position (n,) in pitches (the rest position if the iteration fails), and the number of evaluations
@@ -121,12 +121,12 @@ def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Floa
 
     Args:
         problem: The patch.
-        x: (n,) root of a wire, pitches.
+        x: (n,) root of a wire, in pitches.
         a: (K,) scaled resistances R · gain of the wire.
         inverse: (n, K) ∂x/∂r at ``x``.
 
     Returns:
-        (n,) position of the twin, pitches; not finite if no twin exists to second order.
+        (n,) position of the twin, in pitches; not finite if no twin exists to second order.
     """
     w = np.ones(a.size)
     for _ in range(POWER_STEPS):

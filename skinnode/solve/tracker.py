@@ -151,7 +151,7 @@ class Tracker:
         position, with an infinite standard deviation and a status other than CONVERGED.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
+            frame_ohm: (U, K) resistances, in ohms; values that are not positive and finite are ignored.
             valid: (U, K) bool: False for missing readings; default: all True.
             relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
                 default: the option ``relative_noise``. A resistance is ignored if its standard deviation is

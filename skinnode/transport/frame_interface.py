@@ -28,7 +28,7 @@ class FrameInterface(Protocol):
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames.
 
         Raises:

@@ -29,8 +29,8 @@ WRITABLE: Final = (*SUFFIXES, ".asc")
 """Suffixes of logs that can be written."""
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Maximum size of a BLF container before compression, bytes. Less is written between two flushes, so no frame
-is split between containers."""
+"""Maximum size of a BLF container before compression, in bytes. Less is written between two flushes, so no
+frame is split between containers."""
 
 
 class LoggedFrame(NamedTuple):

@@ -38,7 +38,7 @@ class Damage:
     line: int | None
     """Line number, counted from 1; None for a BLF file."""
     offset: int
-    """Offset from the beginning of the file, bytes."""
+    """Offset from the beginning of the file, in bytes."""
     what: str
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ class _Container(NamedTuple):
     """Container of a BLF file."""
 
     end: int
-    """File offset from which to search for the next container, bytes."""
+    """File offset from which to search for the next container, in bytes."""
     objects: bytes | None
     """Readable part of the content; None if nothing is readable."""
     intact: bool = False

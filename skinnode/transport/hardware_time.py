@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 OLDEST_NS: Final = 10_000_000_000
-"""Maximum plausible age of a frame, ns. If the wall clock was set after a frame had arrived, the frame can
+"""Maximum plausible age of a frame, in ns. If the wall clock was set after a frame had arrived, the frame can
 seem older; its timestamp is then replaced by the time at which the frame is read."""
 
 DRIFT: Final = 200e-6
@@ -25,11 +25,11 @@ class HardwareClock:
         self._last_ns = 0
 
     def arrival_ns(self, hardware_ns: int, kernel_ns: int) -> int:
-        """Return the arrival time of a frame on the monotonic clock, ns.
+        """Return the arrival time of a frame on the monotonic clock, in ns.
 
         Args:
-            hardware_ns: Hardware timestamp, ns.
-            kernel_ns: Kernel timestamp, converted to the monotonic clock, ns.
+            hardware_ns: Hardware timestamp, in ns.
+            kernel_ns: Kernel timestamp, converted to the monotonic clock, in ns.
         """
         offset_ns = kernel_ns - hardware_ns
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) < OLDEST_NS:

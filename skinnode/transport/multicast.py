@@ -70,7 +70,7 @@ _TAG_BYTES: Final = len(new_tag())
 _TAG_AT: Final = pack_message(
     can.Message(arbitration_id=0x7FF, is_extended_id=False, channel=new_tag())
 ).index(b"skinnode-")
-"""Offset of the tag in this program's packets with identifiers of 0x100 or higher, bytes."""
+"""Offset of the tag in this program's packets with identifiers of 0x100 or higher, in bytes."""
 _TAG_END: Final = _TAG_AT + _TAG_BYTES
 
 _RECORD: Final = struct.Struct(
@@ -83,7 +83,7 @@ _MOST_KINDS: Final = 4096
 """Maximum number of packet kinds to remember. Sixteen patches send 100 kinds."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible lead of a frame's timestamp over the time at which the frame is read, ns."""
+"""Maximum plausible lead of a frame's timestamp over the time at which the frame is read, in ns."""
 
 
 class _Kind(NamedTuple):
@@ -165,7 +165,7 @@ class MulticastSocket:
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames.
 
         Raises:

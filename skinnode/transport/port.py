@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames. It holds 4 s of traffic from a
-fully loaded 1 Mbit/s bus."""
+"""Capacity of an endpoint's receive queue on python-can's virtual bus, in frames. It holds 4 s of traffic
+from a fully loaded 1 Mbit/s bus."""
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum plausible age of a timestamp, s. An older timestamp, or one in the future, does not come from this
-machine's wall clock and is replaced by the time at which the frame is read."""
+"""Maximum plausible age of a timestamp, in s. An older timestamp, or one in the future, does not come from
+this machine's wall clock and is replaced by the time at which the frame is read."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 """Kernel error codes for an interface that has gone down. The kernel reports this only once, to the next send
@@ -295,7 +295,7 @@ class CanPort(Closing):
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames. Interfaces other than socketcan, udp_multicast and timed return
                 one at a time.
 

@@ -21,7 +21,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Default capacity of a queue, frames. It holds 2 s of traffic from a fully loaded 1 Mbit/s bus (8,000
+"""Default capacity of a queue, in frames. It holds 2 s of traffic from a fully loaded 1 Mbit/s bus (8,000
 frames/s)."""
 
 _POLL_S: Final = 0.02
@@ -170,7 +170,7 @@ class Intake:
         """Move all received frames from the port to the queue.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
 
         Returns:
             Whether there are new frames or an error for :meth:`take`.

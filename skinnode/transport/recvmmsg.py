@@ -52,8 +52,8 @@ class MessageBatch:
 
     Args:
         count: Maximum number of messages.
-        size: Maximum length of a message, bytes.
-        control: Maximum length of the ancillary data of a message, bytes.
+        size: Maximum length of a message, in bytes.
+        control: Maximum length of the ancillary data of a message, in bytes.
     """
 
     def __init__(self, count: int, size: int, control: int) -> None:

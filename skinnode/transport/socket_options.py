@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Final
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of the buffer."""
+"""Receive buffer size requested for a socket, in bytes. A frame occupies about 800 bytes of the buffer."""
 
 SO_RXQ_OVFL: Final = 40
 """Option from <asm-generic/socket.h> that adds the kernel's drop counter to a message's ancillary data.

@@ -29,7 +29,7 @@ _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1
 
 HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; then 8 or 64 data bytes
 FD_MTU: Final = 72
-"""Size of struct canfd_frame, bytes. Struct can_frame is shorter."""
+"""Size of struct canfd_frame, in bytes. Struct can_frame is shorter."""
 _STAMPS: Final = struct.Struct("@qqqqqq")  # three timestamps in s and ns: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
@@ -84,7 +84,7 @@ class SocketReader:
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames, up to :data:`BATCH_FRAMES`.
 
         Raises:

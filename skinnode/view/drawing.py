@@ -62,7 +62,7 @@ class HandDrawing:
         stream: The recording stream; the caller sets its sinks and closes it.
         hand: The hand.
         exaggeration: Ratio of drawn to measured displacement.
-        wall_minus_mono_ns: Wall-clock time minus tick time, ns.
+        wall_minus_mono_ns: Wall-clock time minus tick time, in ns.
         live: Whether the viewer follows the newest data.
     """
 

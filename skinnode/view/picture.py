@@ -15,7 +15,7 @@ from skinnode.view.colours import depth_rgba, grey_rgba
 from skinnode.view.geometry import displaced_m, force_n, normals, ring_m
 
 FORCE_M_PER_N: Final = 0.012
-"""Arrow length for a force of 1 N, m."""
+"""Arrow length for a force of 1 N, in m."""
 SHEAR: Final = 4.0
 """Extra magnification of shear arrows relative to the surface, as on the monitor's maps, because shear is
 about a quarter of the depth."""
@@ -32,9 +32,9 @@ class Style:
     exaggeration: float
     """Ratio of drawn to measured displacement."""
     full_m: float
-    """Depth shown in the brightest colour, m."""
+    """Depth shown in the brightest colour, in m."""
     pitch_m: float
-    """Distance between neighbouring electrodes of the patch, m."""
+    """Distance between neighbouring electrodes of the patch, in m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ def picture_of(field: FieldFrame, rest_m: Float, style: Style) -> PatchPicture:
 
     Args:
         field: The field.
-        rest_m: (U, N, 3) positions of the electrodes at rest, m.
+        rest_m: (U, N, 3) positions of the electrodes at rest, in m.
         style: Scales of the picture.
     """
     unknown = ~np.isfinite(field.displacement_std_m[..., 2])
@@ -110,7 +110,7 @@ def stale_picture_of(rest_m: Float) -> PatchPicture:
     """Return the picture of a patch without an up-to-date field: its surface at rest, in grey.
 
     Args:
-        rest_m: (U, N, 3) positions of the electrodes at rest, m.
+        rest_m: (U, N, 3) positions of the electrodes at rest, in m.
     """
     none = np.empty((0, 3))
     return PatchPicture(

@@ -18,13 +18,13 @@ def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
     """Predict positions by an Euler step along ∂x/∂R.
 
     Args:
-        x: (U, n) last solution of each wire, pitches.
+        x: (U, n) last solution of each wire, in pitches.
         inverse: (U, n, K) ∂x/∂r at ``x``.
         a_solved: (U, K) R · gain at ``x``.
         a: (U, K) R · gain at the next point.
 
     Returns:
-        (U, n) positions, pitches.
+        (U, n) positions, in pitches.
     """
     change = a / a_solved - 1.0
     return np.asarray(x - np.einsum("ujk,uk->uj", inverse, change))
@@ -41,13 +41,13 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
     stays at its value in ``x``.
 
     Args:
-        x_before: (U, n) positions at the second-to-last point, pitches.
+        x_before: (U, n) positions at the second-to-last point, in pitches.
         a_before: (U, K) R · gain at ``x_before``.
-        x: (U, n) positions at the last point, pitches.
+        x: (U, n) positions at the last point, in pitches.
         a: (U, K) R · gain at ``x``.
         a_next: (U, K) R · gain at the next point.
-        reach: Maximum change in a coordinate, pitches.
-        out: (U, n) output: predicted positions, pitches.
+        reach: Maximum change in a coordinate, in pitches.
+        out: (U, n) output: predicted positions, in pitches.
     """
     for u in range(x.shape[0]):
         along, square, longest = 0.0, SQUARE_FLOOR, reach

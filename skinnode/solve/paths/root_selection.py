@@ -37,9 +37,9 @@ class PatchEstimate:
     """Estimate of the whole patch, for checking roots."""
 
     x: Float
-    """(U, n) positions, pitches."""
+    """(U, n) positions, in pitches."""
     std: Float
-    """(U, n) standard deviations, pitches."""
+    """(U, n) standard deviations, in pitches."""
 
     def agrees(self, x: Float) -> Mask:
         """Return a mask (U,) of the wires whose positions (U, n), in pitches, the estimate confirms."""
@@ -140,7 +140,7 @@ def keep_likeliest(
 
     Args:
         tracker: Tracker at the end of its path.
-        starts: (S, U, n) starting positions, pitches.
+        starts: (S, U, n) starting positions, in pitches.
         energy: Function that returns the energy of a displacement field (U, n) in pitches: −2 log of its
             probability density, up to a constant.
         unlikely: (U,) minimum energy difference between the likeliest root and any other root.

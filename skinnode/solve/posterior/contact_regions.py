@@ -374,7 +374,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
         rows: (m, 3Q) rows of L⁻¹ J G before multiplication by ``weight``.
         weight: (m,) factor of each row.
         share: (Q,) prior variances of the loads, relative to ``scale2``.
-        scale2: Squared scale s² of the prior, pitch².
+        scale2: Squared scale s² of the prior, in pitch².
         own: (Q,) bool: True for a cell with an electrode.
         near: (Q, 9) indices of each cell and its neighbours; −1 outside the lattice.
         before: (Q,) contact number of each cell in the last frame.

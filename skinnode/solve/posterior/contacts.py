@@ -57,7 +57,7 @@ class LoadEstimate:
     share: Float
     """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float
-    """Squared scale s² of the prior, pitch²."""
+    """Squared scale s² of the prior, in pitch²."""
     doubt: float = PRIOR_DOUBT
     """Factor applied to the variances, because the loads depend mainly on the prior."""
 
@@ -109,7 +109,7 @@ class ContactFinder:
         self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
         self._depth_m, self._depth = np.zeros((2, cells))
         self._press = np.zeros(cells)
-        self._field = np.zeros((2, len(self._own), 3))  # displacement and its standard deviations, m
+        self._field = np.zeros((2, len(self._own), 3))  # displacement and its standard deviations, in m
         self._scratch = region_scratch(cells)
         self._work = np.empty(cells, np.int64), np.empty(cells), np.empty((cells, 5))
 

@@ -48,17 +48,17 @@ class ElasticPrior:
     """
 
     covariance: Float
-    """(3UN, 3UN) covariance C of the displacement, pitch²."""
+    """(3UN, 3UN) covariance C of the displacement, in pitch²."""
     response: Float
-    """(3UN, 3Q) displacement per unit load, pitches. At s = 1, each load has a standard deviation of 1."""
+    """(3UN, 3Q) displacement per unit load, in pitches. At s = 1, each load has a standard deviation of 1."""
     load_n: Float
-    """(3,) force of a unit load along the wire, across the wire and along the normal, N."""
+    """(3,) force of a unit load along the wire, across the wire and along the normal, in N."""
     cell_m: Float
-    """(Q, 3) centres of the cells, m."""
+    """(Q, 3) centres of the cells, in m."""
     frame: Float
     """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     cell_area_m2: float
-    """Area of a cell, m²."""
+    """Area of a cell, in m²."""
     shape: tuple[int, int]
     """Number of cells across and along the wires; their product is Q."""
 

@@ -75,7 +75,7 @@ class FrameEstimator:
     Attributes:
         layout: The patch.
         options: Options in effect.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 before :meth:`warm_up` or if no
+        from_rest_s: Minimum time to solve a touched frame from rest, in s; 0 before :meth:`warm_up` or if no
             deadline is set.
         noise_estimate: Estimate of the stream's noise, used to scale the stated noise; None if the stated
             noise is used unchanged.
@@ -188,7 +188,7 @@ class FrameEstimator:
         """Estimate the field of one frame like :meth:`skinnode.Posterior.update`, but without the data check.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm. Values that are not positive and finite are ignored.
+            frame_ohm: (U, K) resistances, in ohms. Values that are not positive and finite are ignored.
             valid: (U, K) bool: False where a reading is missing.
             relative_noise: Relative noise of this frame, a number or (U, K).
 
@@ -238,7 +238,7 @@ class FrameEstimator:
         this covariance does not.
 
         Returns:
-            (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
+            (3UN, 3UN) covariance, in m²; 0 for coordinates that are not free.
 
         Raises:
             RuntimeError: If the last frame was not solved.
@@ -257,7 +257,7 @@ class FrameEstimator:
         The result is −2 log of the prior density, up to a constant.
 
         Args:
-            moved: (U, 3N) displacement u, pitches.
+            moved: (U, 3N) displacement u, in pitches.
         """
         return self._estimator.roughness(moved) / self._estimator.load_prior.scale2
 

@@ -89,7 +89,7 @@ class GeometryError:
 
         Args:
             members: (P,) numbers of the wires.
-            moved: (U, 3N) displacement, pitches.
+            moved: (U, 3N) displacement, in pitches.
             a: (U, K) resistances times gain, R · gain.
             weight: (U, K) weights 1/σ of the resistances.
             g: Geometry nuisances; their number is given by :func:`nuisances`.
@@ -121,7 +121,7 @@ class GeometryError:
         )  # fmt: skip
 
     def _shifts(self, g: Float) -> tuple[Float, Float]:
-        """Return the upper electrodes' shifts (U, 3N) and the shifted lower electrodes (3, M, K), pitches."""
+        """Return the upper electrodes' shifts (U, 3N) and shifted lower electrodes (3, M, K), in pitches."""
         wires, coordinates = self._problem.rest.shape
         upper = g[COMMON : COMMON + UPPER * wires].reshape(wires, UPPER)[:, :3]
         lower = g[COMMON + UPPER * wires :].reshape(-1, LOWER)

@@ -68,8 +68,8 @@ class Hyperparameters:
 
     Args:
         estimator: MAP estimator of the patch.
-        clearance: Median clearance, pitches.
-        scale2: Fixed s², pitch²; None to estimate it.
+        clearance: Median clearance, in pitches.
+        scale2: Fixed s², in pitch²; None to estimate it.
         estimate_noise: Whether to estimate the noise.
         discs: Discs in which loads are expected; None to expect loads in the cells where they were found.
 

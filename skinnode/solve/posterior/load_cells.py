@@ -24,15 +24,15 @@ class LoadCells:
     """Cells of one layout, with E = U N electrodes and Q cells."""
 
     centre_m: Float
-    """(Q, 3) centres of the cells, m."""
+    """(Q, 3) centres of the cells, in m."""
     frame: Float
     """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     electrode_frame: Float
     """(E, 3, 3) unit vectors at the electrodes, in the order of ``frame``."""
     offset_m: Float
-    """(E, Q, 2) offset of each electrode from each cell, along the tangents of the cell, m."""
+    """(E, Q, 2) offset of each electrode from each cell, along the tangents of the cell, in m."""
     height_m: float
-    """Median height of the electrodes above the lower layer, m."""
+    """Median height of the electrodes above the lower layer, in m."""
     size_m: tuple[float, float]
     """Size of a cell along and across the wires, in m."""
     shape: tuple[int, int]
@@ -65,11 +65,11 @@ class LoadCells:
         return cls(cell, frame, own, flat, height, size, shape)
 
     def displacement(self, compliance: Float) -> Float:
-        """Return the displacements (E, 3, Q, L) per unit load in the axes of the patch, m.
+        """Return the displacements (E, 3, Q, L) per unit load in the axes of the patch, in m.
 
         Args:
             compliance: (E, Q, 3, L) displacements per unit load along the tangents and the normal of the
-                electrode, m.
+                electrode, in m.
         """
         return np.asarray(np.einsum("eti,eqtl->eiql", self.electrode_frame, compliance))
 

@@ -67,11 +67,11 @@ class UniformPrior:
     """Prior of the free coordinates for equal expected loads at s = 1; shared by all patches of a layout."""
 
     response: Float
-    """(U f, 3Q) displacement per unit load, pitches."""
+    """(U f, 3Q) displacement per unit load, in pitches."""
     response_t: Float
     """(3Q, U f) transposed response."""
     covariance: Float
-    """(U f, U f) matrix C, pitch²."""
+    """(U f, U f) matrix C, in pitch²."""
     root: Float
     """(U f, U f) array containing the Cholesky factor of C."""
     blur: Float
@@ -105,11 +105,11 @@ class LoadPrior:
         free: (U f,) indices of the free coordinates.
 
     Attributes:
-        scale2: s², pitch².
+        scale2: s², in pitch².
         share: (Q,) load variance of each cell, relative to s²; the mean is 1.
         covariance: (U f, U f) matrix C; read-only.
         uniform: (U f, U f) matrix C for equal expected loads over the whole patch; read-only.
-        response: (U f, 3Q) displacement per unit load, pitches.
+        response: (U f, 3Q) displacement per unit load, in pitches.
         doubt: Factor applied to the part of the variance that depends on the prior.
         smooth_share: Value of ``doubt`` for the 95 % interval.
         version: Number of times that C has been rebuilt.
@@ -138,7 +138,7 @@ class LoadPrior:
         """Set the variances of the loads, and rebuild the prior if they have changed enough.
 
         Args:
-            variance: (Q,) load variance of each cell, pitch².
+            variance: (Q,) load variance of each cell, in pitch².
 
         Returns:
             Whether the prior was rebuilt.
@@ -161,9 +161,10 @@ class LoadPrior:
         """Set the load variances for a skin that is untouched except for discs on a few cells.
 
         Args:
-            variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, pitch².
-            layer: (U f, Q) displacement per unit load on a bonded layer, pitches.
-            untouched2: Variance of the half-space loads on untouched skin, pitch².
+            variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, in
+                pitch².
+            layer: (U f, Q) displacement per unit load on a bonded layer, in pitches.
+            untouched2: Variance of the half-space loads on untouched skin, in pitch².
         """
         loaded = variance[0] > DISC_FAINT * untouched2
         own = np.where(loaded, variance[0], 0.0) + untouched2
@@ -190,8 +191,8 @@ class LoadPrior:
         expected loads, and only if a press is certain.
 
         Args:
-            found: (Q,) squared loads found in the frame, pitch².
-            least: Minimum variance, pitch².
+            found: (Q,) squared loads found in the frame, in pitch².
+            least: Minimum variance, in pitch².
             certain: Whether a press is certain.
         """
         floor = LOCAL_FLOOR * float(found.mean()) + least
@@ -206,7 +207,7 @@ class LoadPrior:
         """Return the mean loads for a given displacement.
 
         Args:
-            displacement: (U f,) free coordinates, pitches.
+            displacement: (U f,) free coordinates, in pitches.
 
         Returns:
             (Q, 3) mean loads, in units of the prior's loads.

@@ -84,11 +84,11 @@ class MapEstimator:
 
     Attributes:
         load_prior: Prior of the loads and of the displacement.
-        moved: (U, 3N) displacement, pitches; 0 for fixed coordinates.
+        moved: (U, 3N) displacement, in pitches; 0 for fixed coordinates.
         g: The p nuisances, followed by the geometry errors.
-        std: (U, f) standard deviations from the last factors, pitches.
-        core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
-        noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
+        std: (U, f) standard deviations from the last factors, in pitches.
+        core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, in pitches.
+        noise_variance: (U f,) variance of the displacement due to noise and nuisances, in pitch².
         members: Wires whose equations are in the factors.
         factors: Serial number of the current factors.
         evaluations: Number of evaluations of F and its Jacobian, per wire. The caller resets the counter.
@@ -117,7 +117,7 @@ class MapEstimator:
         )
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # convergence tolerance for the RMS of a chord step, pitches
+        self._enough = math.inf  # convergence tolerance for the RMS of a chord step, in pitches
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
@@ -346,7 +346,7 @@ class MapEstimator:
 
         Args:
             weight: Weight of the prior on s², as an equivalent number of parameters.
-            scale2: Value of s² expected by this prior, pitch².
+            scale2: Value of s² expected by this prior, in pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
 

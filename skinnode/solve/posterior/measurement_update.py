@@ -333,7 +333,7 @@ def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
 def noise_variance(  # noqa: C901 - a kernel: sums as loops
     m: int, d: Float, b: Buffers, kalman_gain_t: Float, out: Float
 ) -> None:
-    """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
+    """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), in pitch².
 
     The variance is diag(K (I + H d Hᵀ) Kᵀ). The transposed Kalman gain Kᵀ = L⁻ᵀ V, the change in the estimate
     per unit of noise in each equation, is written to ``kalman_gain_t`` (m, U f). V and L are read from ``b``.
@@ -400,7 +400,7 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     """Write a chord step with the current factors into ``step``: U f coordinates, followed by the nuisances.
 
     The residuals r, Jᵀ and the effects of the geometry errors at ``x`` (U, 3N) are read from ``b``. Returns
-    the RMS and the largest absolute value of the changes in the coordinates, pitches.
+    the RMS and the largest absolute value of the changes in the coordinates, in pitches.
     """
     f, p = free.size, h.shape[2]
     wires, equations = b.r.shape

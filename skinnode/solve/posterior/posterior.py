@@ -39,7 +39,7 @@ class Posterior(FrameEstimator):
         layout: The patch.
         options: Options in effect.
         check: Data check of the readings.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 if no deadline is set.
+        from_rest_s: Minimum time to solve a touched frame from rest, in s; 0 if no deadline is set.
         noise_estimate: Estimate of the stream's noise, used to scale the stated noise; None if the stated
             noise is used unchanged.
 
@@ -79,11 +79,11 @@ class Posterior(FrameEstimator):
         cannot be solved, the last trusted field is returned with an infinite standard deviation.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm. Values that are not positive and finite are ignored.
+            frame_ohm: (U, K) resistances, in ohms. Values that are not positive and finite are ignored.
             valid: (U, K) bool: False where a reading is missing; all True by default.
             relative_noise: Relative noise of this frame only, a number or (U, K). Resistances whose noise is
                 not positive and finite are ignored.
-            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, ohm. It is
+            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, in ohms. It is
                 combined with ``relative_noise`` as independent noise.
 
         Returns:

@@ -169,16 +169,16 @@ class FrameArrays(ArrayTable):
     """Mask of the wires with an acceptable root."""
     status: Annotated[Index, "U"]
     moved_m: Annotated[Float, "U 3N"]
-    """Displacement of each coordinate, m."""
+    """Displacement of each coordinate, in m."""
     std_m: Annotated[Float, "U 3N"]
-    """Standard deviation of ``moved_m``, m."""
+    """Standard deviation of ``moved_m``, in m."""
     held: Annotated[Mask, "U"]
 
     def __init__(self, problem: PatchProblem, rest_branch: Index, unknowns: Index, first: int) -> None:
         shape, rest = problem.layout.shape, problem.rest
         upper = shape[0]
         self.outcome_m = np.empty((2, *problem.layout.upper_m.shape))
-        """(2, U, N, 3) displacements of the electrodes and their standard deviations, m."""
+        """(2, U, N, 3) displacements of the electrodes and their standard deviations, in m."""
         moved_m, std_m = self.outcome_m.reshape(2, *rest.shape)
         baseline_ohm, code_gain, rounding_ohm = np.ones((3, *shape))
         ohm, noise, a, weight, used = np.empty((5, *shape))

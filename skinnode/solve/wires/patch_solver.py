@@ -110,12 +110,12 @@ class PatchSolver:
         self.problem = problem
         self.operator = operator
         self.x = problem.rest.copy()
-        """(U, 3N) positions, pitches: starting points before a solve, solutions after it."""
+        """(U, 3N) positions, in pitches: starting points before a solve, solutions after it."""
         self.inverse = np.zeros((upper, unknowns, lower))
         self.a_solved = np.ones((upper, lower))
         self.noise = np.zeros((upper, lower))
         self.std = np.full((upper, unknowns), np.inf)
-        """(U, 3N) standard deviation of ``x``, pitches; inf if unknown."""
+        """(U, 3N) standard deviation of ``x``, in pitches; inf if unknown."""
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
@@ -126,7 +126,7 @@ class PatchSolver:
         The frame number determines which wires compute a new inverse despite REUSE.
         """
         self.still_std = np.full((upper, unknowns), np.inf)
-        """(U, 3N) standard deviations of the coordinates that are not unknowns, pitches."""
+        """(U, 3N) standard deviations of the coordinates that are not unknowns, in pitches."""
         self.each = 1 if normal_only else 3
         """Number of unknowns per electrode."""
         most = unknowns // 3

@@ -34,9 +34,9 @@ class PatchProblem:
 
     layout: PatchLayout
     rest: Float
-    """(U, 3N) positions of the upper electrodes at rest, pitches."""
+    """(U, 3N) positions of the upper electrodes at rest, in pitches."""
     lower: Float
-    """(3, M, K) positions of the lower electrodes, pitches."""
+    """(3, M, K) positions of the lower electrodes, in pitches."""
     gain: Float
     """(U, K) factors 1 / (R₀ F₀) that convert resistances in ohms to scaled resistances."""
     a_rest: Float
@@ -44,7 +44,7 @@ class PatchProblem:
     share_at_rest: Float
     """(U, N, K) contribution of each upper electrode to F at rest."""
     clearance: Float
-    """(U, N) distance of each upper electrode from the nearest lower electrode at rest, pitches."""
+    """(U, N) distance of each upper electrode from the nearest lower electrode at rest, in pitches."""
 
     @classmethod
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:

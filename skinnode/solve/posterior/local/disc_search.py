@@ -34,15 +34,15 @@ over the whole patch."""
 LAYER_RANGE: Final = (0.02, 5.0)
 """Minimum and maximum layer share β."""
 BEYOND: Final = 1
-"""Maximum distance of a disc's centre beyond the outermost electrodes, cells."""
+"""Maximum distance of a disc's centre beyond the outermost electrodes, in cells."""
 AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
-"""Radius around the start of a search within which the effects of loads are computed, cells."""
+"""Radius around the start of a search within which the effects of loads are computed, in cells."""
 MOST: Final = 4
 """Number of discs at which the search is abandoned. Loads that require this many discs are not local."""
 WIDE: Final = 3.0
-"""Disc radius above which the search is abandoned, cells. For large contacts and plates, the standard
+"""Disc radius above which the search is abandoned, in cells. For large contacts and plates, the standard
 deviations from discs would be too small."""
 PAYS: Final = 2.0
 """Minimum gain in log evidence for adding another disc, in excess of the logarithm of the number of
@@ -51,7 +51,7 @@ NOTICED: Final = 8.0
 """Minimum squared match between a load and the remaining data at which another disc is tried, in noise
 variances."""
 NEAR: Final = 1.0
-"""Radius of the discs that are matched to the data to find a starting point, cells."""
+"""Radius of the discs that are matched to the data to find a starting point, in cells."""
 
 
 class DiscPrior:
@@ -60,12 +60,12 @@ class DiscPrior:
     Args:
         estimator: MAP estimator of the patch.
         shape: Numbers of cells across and along the wires.
-        clearance: Median clearance, pitches.
-        layer: (U f, Q) displacement per unit load on a bonded layer, pitches.
+        clearance: Median clearance, in pitches.
+        layer: (U f, Q) displacement per unit load on a bonded layer, in pitches.
 
     Attributes:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
-        spread: (U f,) variance of the displacement due to the uncertainty of the discs, pitch².
+        spread: (U f,) variance of the displacement due to the uncertainty of the discs, in pitch².
     """
 
     def __init__(
@@ -111,15 +111,15 @@ class DiscPrior:
         *,
         spread: bool,
     ) -> Float | None:
-        """Fit the discs to a frame, and return the load variances (2, Q), pitch².
+        """Fit the discs to a frame, and return the load variances (2, Q), in pitch².
 
         The estimator's factors are overwritten.
 
         Args:
             observation: The frame.
             members: Wires whose equations are used.
-            untouched2: s² of the loads on untouched skin, pitch².
-            uniform2: s² of equal loads over the whole patch, pitch².
+            untouched2: s² of the loads on untouched skin, in pitch².
+            uniform2: s² of equal loads over the whole patch, in pitch².
             spread: Whether to compute :attr:`spread` as well.
 
         Returns:

@@ -33,15 +33,15 @@ from skinnode.solve.linalg.cholesky import cholesky, solve_lower_transposed_vect
 from skinnode.solve.linalg.vectors import Index
 
 SOFT: Final = 0.25
-"""Rim width of a disc, cells."""
+"""Rim width of a disc, in cells."""
 FAINT: Final = 0.03
 """Load variance of a cell, relative to the largest, below which the cell is neglected in the evidence."""
 RADIUS: Final = 1.5
-"""Expected radius of a disc, cells."""
+"""Expected radius of a disc, in cells."""
 RADIUS_SPREAD: Final = 0.7
 """Standard deviation of ln(R + ¼) in the prior of a disc."""
 RADIUS_RANGE: Final = (0.3, 4.0)
-"""Minimum and maximum radius of a disc, cells."""
+"""Minimum and maximum radius of a disc, in cells."""
 AMPLITUDE_SPREAD: Final = 1.0
 """Standard deviation of ln a in the prior of a disc."""
 LAYER: Final = 0.5

@@ -29,7 +29,7 @@ In 2,640 simulated fields of healthy patches (ten layouts, relative noise 3e-6 t
 the largest ratio was 12.2.
 """
 MOST: Final = 0.3
-"""Upper bound of the default limit, in clearances; larger standard deviations mean that the prior dominates
+"""Upper bound on the default limit, in clearances; larger standard deviations mean that the prior dominates
 the displacement.
 
 Of the 2,640 fields described at :data:`MULTIPLE`, only those with h = 1 and a relative noise of 1e-3 exceeded

@@ -2,7 +2,7 @@
 
 A root is doubtful in three cases: an electrode moved too far since the previous frame, the displacement is
 too rough for a press, or a press can move the wire across a fold, where two roots of F = b merge. Near a
-fold, the exact inverse cannot tell which of two roots is correct. A wire without a root is doubtful too. The
+fold, the exact inverse cannot tell which of two roots is correct. A wire without a root is also doubtful. The
 posterior, which estimates the positions from all wires of the patch, decides on each doubtful root.
 :mod:`skinnode.solve.roots` defines the thresholds.
 """
@@ -68,7 +68,7 @@ class RootGate:
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # remaining number of frames without a posterior solve
         self.hurried = False
-        """Whether the last call of :meth:`check` had too little time to check all doubtful roots."""
+        """Whether the last call to :meth:`check` had too little time to check all doubtful roots."""
         self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, in m
         self._apart = np.zeros((len(problem.rest), 1, 1))  # added to the standard deviation, in m; see APART
         self._any_apart = False
@@ -228,7 +228,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # updated by the next call of _keep_apart
+        self._any_apart = True  # updated by the next call to _keep_apart
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)

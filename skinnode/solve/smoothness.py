@@ -20,7 +20,7 @@ CORRELATION_PITCHES: Final = 1.0
 """Correlation length ℓ, in pitches. On the simulated staggered layout, the guided start found 3204 of 3209
 roots with a length of 1 pitch, and fewer with 0.7 or 1.5 pitches."""
 ROUGH_SHARE: Final = 1e-3
-"""Relative increase in the diagonal of C, which keeps C from being numerically singular."""
+"""Relative increase in the diagonal of C that keeps C from being numerically singular."""
 
 
 class Smoothness:

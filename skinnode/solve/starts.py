@@ -4,8 +4,8 @@
 with noise that decreases from one Gauss-Newton step to the next (Tarantola 2005, section 3.4).
 
 ``near_twin`` estimates the twin of a root, which is the root on the other side of the nearest fold. Let σ be
-the smallest singular value of J at the root x, with the left vector w and the right vector v. To second
-order, x + α v is a root if σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
+the smallest singular value of J at the root x, with left singular vector w and right singular vector v. To
+second order, x + α v is a root if σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
 (Golubitsky & Schaeffer 1985, chapter I.3).
 """
 
@@ -29,8 +29,8 @@ NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
 With one per decade, the guided start fails on an additional 1 % of simulated wires.
 """
 POWER_STEPS: Final = 8
-"""Number of inverse iterations for the smallest singular value of J. The next singular value is about three
-times as large, so the iteration converges quickly."""
+"""Number of inverse iterations used to find the smallest singular value of J. The next singular value is
+about three times as large, so the iteration converges quickly."""
 DIFFERENCE: Final = 1e-4
 """Step in either direction for the central difference of two Jacobians, in pitches. It is much larger than
 eps^(1/3) = 6e-6, which makes rounding errors negligible."""

@@ -10,7 +10,7 @@ from skinnode.transport.frame import Frame
 
 @runtime_checkable
 class FrameInterface(Protocol):
-    """Interface that can exchange frames directly, as :class:`~skinnode.transport.CanPort` then does.
+    """Interface with direct frame methods, which :class:`~skinnode.transport.CanPort` uses if present.
 
     On a simulated bus, converting frames to ``can.Message`` and back would take longer than everything else.
     A python-can interface may provide these methods; for udp_multicast,

@@ -6,7 +6,7 @@ stops the writer, and a new writer appends the next frame.
 
 An ASC file contains its start time as local time without a time zone, and the time of each frame relative to
 the start. The start time written here is a whole second, because python-can's writer and reader disagree
-about fractions of a second. An ASC file does not contain the identifier and data of an error frame.
+about fractions of a second. An ASC file does not contain the identifiers or data of error frames.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass all frames to the operating system, so that they survive if the process ends.
+        """Pass all frames to the operating system, so that they are not lost if the process ends.
 
         Args:
             to_disk: Whether to wait until the frames are on the disk, so that they survive a power failure.

@@ -109,7 +109,7 @@ class FrameLogReader:
         """Yield the frames of an ASC file. python-can parses the file and skips lines that are not frames."""
         head = self._file.read(_ASC_HEAD_BYTES)
         if re.search(rb"^date\s", head, re.MULTILINE | re.IGNORECASE) is None:
-            self._complain(1, 0, f"no ASC file: {_shown(head[:16])}")
+            self._complain(1, 0, f"not an ASC file: {_shown(head[:16])}")
             return
         self._file.seek(0)
         text = io.TextIOWrapper(self._file, encoding="ascii", errors="replace")

@@ -6,7 +6,7 @@ from typing import Final
 
 OLDEST_NS: Final = 10_000_000_000
 """Maximum plausible age of a frame, in ns. If the wall clock was set after a frame had arrived, the frame can
-seem older; its timestamp is then replaced by the time at which the frame is read."""
+appear older; its timestamp is then replaced by the time at which the frame is read."""
 
 DRIFT: Final = 200e-6
 """Maximum relative drift between two clocks whose oscillators each have a tolerance of 100 ppm."""

@@ -5,16 +5,16 @@ attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgp
 sending it. However, everything except the timestamp and the data recurs in a program's packets, so python-can
 converts each kind of frame only once:
 
-- To send a frame, its data is inserted into a packet that python-can has packed for this identifier and
+- When a frame is sent, its data is inserted into a packet that python-can has packed for this identifier and
   length.
 - A received packet is compared, without its timestamp and data, with the packets that python-can has already
   unpacked. If the packet differs from all of these or has a different layout, python-can unpacks it.
 
 Like python-can's interface, this interface has no arbitration and does not guarantee delivery or order: it is
-meant for tests of programs, not of a bus under load.
+meant for testing programs, not for testing a bus under load.
 
-Packets are received in batches, with kernel timestamps and the kernel's drop counter. A sender also receives
-its own packets. The sender skips these packets, which it identifies by a tag in the channel field. python-can
+Packets are received in batches, with kernel timestamps and the kernel's drop counter. An endpoint also
+receives its own packets. It identifies them by a tag in the channel field and skips them. python-can
 transmits this field but does not use it.
 """
 
@@ -115,7 +115,7 @@ class MulticastSocket:
         self._batch = MessageBatch(_BATCH_PACKETS, _PACKET_BYTES, _COUNTED_BYTES)
         self._waiting: list[Frame] = []
         self.dropped = 0
-        """Number of packets, including the endpoint's own, dropped because of a full receive buffer."""
+        """Number of packets, including the endpoint's own, dropped because the receive buffer was full."""
         self.malformed = 0
         """Number of received packets that were not CAN frames."""
         self._sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)

@@ -42,7 +42,7 @@ itself is fetched without delay."""
 _SHORT_NS: Final = 300_000
 """Minimum pause (ns) between batches of frames; used around a predicted arrival."""
 _LATE_NS: Final = 600_000
-"""Time (ns) after a predicted arrival for which the minimum pause is used."""
+"""Time (ns) after a predicted arrival during which the minimum pause is used."""
 _GIVEN_UP_NS: Final = 200_000_000
 """Time (ns) after its predicted arrival at which a frame is considered lost."""
 _ANSWER_NS: Final = 20_000_000
@@ -146,7 +146,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return when to fetch the next predicted frame (ns), and whether all arrivals are predicted."""
+        """Return the next predicted frame's fetch time (ns), and whether all arrivals are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -261,7 +261,7 @@ class Receiver(Closing):
             self._on_signal(intake)  # frames may already have arrived
             return
         if intake in self._alone:
-            # The error makes the old thread end, so it must not be cleared earlier.
+            # The error causes the old thread to end, so it must not be cleared earlier.
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
@@ -284,7 +284,7 @@ class Receiver(Closing):
     def _fetch_signalled(self) -> None:
         """Fetch the announced frames. Fetch from all ports every :data:`_POLL_S`.
 
-        This detects a failed port, and updates :attr:`Intake.seen_ns` of a port without frames.
+        This detects failed ports, and updates :attr:`Intake.seen_ns` for ports without frames.
         """
         now_ns = clock.monotonic_ns()
         intakes = _drained(self._announced)

@@ -19,7 +19,7 @@ _SO_RCVBUFFORCE: Final = 33  # from <asm-generic/socket.h>
 
 
 def enlarge_receive_buffer(sock: socket.socket) -> None:
-    """Set a socket's receive buffer size to :data:`RECEIVE_BUFFER_BYTES`, or to the permitted maximum."""
+    """Set a socket's receive buffer size to :data:`RECEIVE_BUFFER_BYTES`, or to the maximum permitted."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
     except OSError:  # only root may exceed net.core.rmem_max

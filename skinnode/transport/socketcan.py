@@ -1,4 +1,4 @@
-"""Batched reception from a raw SocketCAN socket, with kernel timestamps and the kernel's drop counter.
+"""Receives frames in batches from a raw SocketCAN socket, with kernel timestamps and drop counter.
 
 python-can opens the socket and sends frames. It is not used to receive frames, because it makes two system
 calls per frame and ignores the drop counter. Structures and constants are from <linux/can.h>,

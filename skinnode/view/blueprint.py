@@ -1,4 +1,4 @@
-"""Layout of the viewer's window: the hand in 3-D with texts beside it and curves below it."""
+"""Layout of the viewer's window: the hand in 3-D, with text beside it and curves below it."""
 
 from __future__ import annotations
 

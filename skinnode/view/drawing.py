@@ -1,4 +1,4 @@
-"""Writes pictures, curves and texts to a Rerun recording stream."""
+"""Writes pictures, curves and text to a Rerun recording stream."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class DrawingProcess(Closing):
         self._process.close()
 
     def _complaint(self) -> str:
-        """Return the reason why the child process has ended."""
+        """Return the reason why the child process ended."""
         with suppress(EOFError, OSError):
             if self._connection.poll(1.0):
                 return str(self._connection.recv())

@@ -29,7 +29,7 @@ _QUEUED: Final = 8
 
 
 class DrawingThread(Closing):
-    """Thread that draws a source, from construction until :meth:`close`.
+    """Thread that draws the fields of a source, from construction until :meth:`close`.
 
     Args:
         source: Host or recording; the caller closes it.

@@ -58,7 +58,7 @@ class PatchPicture:
     force_origins_m: Float
     """(C, 3): start point of each contact's force arrow, which ends at the contact's centre."""
     force_m: Float
-    """(C, 3): arrows of the forces on the skin, :data:`FORCE_M_PER_N` long per newton."""
+    """(C, 3): arrows of the forces on the skin, with a length of :data:`FORCE_M_PER_N` per newton."""
     force_std_m: Float
     """(C, 3): half-axes of each force's 95 % ellipsoid along the contact's axes, on the same scale as the
     arrow."""

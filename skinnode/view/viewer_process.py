@@ -137,7 +137,7 @@ def require_free(address: str, port: int) -> None:
 
 
 def free_port() -> int:
-    """Return a port of this machine that is currently free."""
+    """Return a port that is currently free on this machine."""
     with socket.socket() as trial:
         trial.bind((LOCAL, 0))
         port: int = trial.getsockname()[1]

@@ -23,7 +23,7 @@ class CortexM0:
     """Emulated Cortex-M0+ with a program.
 
     Args:
-        elf: program linked to :data:`FLASH` and :data:`RAM`, without initialised data.
+        elf: Program linked to :data:`FLASH` and :data:`RAM`, without initialised data.
     """
 
     def __init__(self, elf: Path) -> None:

@@ -31,7 +31,7 @@ HERE: Final = Path(__file__).parent
 
 
 def tree_of(commit: str | None, folder: Path) -> Path:
-    """Extract ``commit`` to ``folder`` and return the folder; for None, return the working tree."""
+    """Return ``folder`` with ``commit`` extracted to it, or the working tree if ``commit`` is None."""
     if commit is None:
         return ROOT
     folder.mkdir()

@@ -11,7 +11,7 @@ from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
 
 SQUARE_FLOOR: Final = 1e-300
-"""Lower limit of divisors, to prevent division by zero."""
+"""Lower limit on divisors, to prevent division by zero."""
 
 
 def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
@@ -36,9 +36,9 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
 ) -> None:
     """Predict positions along the secant through the last two solved points.
 
-    The predicted step is a multiple of the last step. The factor is the next relative change in ``a``,
+    The predicted step is a multiple of the last step. The multiple is the next relative change in ``a``,
     projected onto the last relative change and divided by it. A coordinate whose prediction is not finite
-    stays at its value in ``x``.
+    keeps its value in ``x``.
 
     Args:
         x_before: (U, n) positions at the second-to-last point, in pitches.

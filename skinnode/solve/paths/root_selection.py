@@ -1,4 +1,4 @@
-"""Root selection at the last sample of a path: second attempts, and tests that accept or reject a root.
+"""Root selection at the last sample of a path: second attempts and acceptance tests.
 
 A fold is a surface where det J = 0. The twin of a root is the root on the other side of a nearby fold.
 :mod:`skinnode.solve.roots` defines the thresholds. The functions modify :attr:`PathTracker.end` and the
@@ -24,7 +24,7 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`).
+"""Maximum number of steps in a solve that starts at the smoothest displacement (:func:`guide`).
 
 Solves that start near a root take 1 to 20 steps. Others do not converge.
 """
@@ -34,7 +34,7 @@ TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchEstimate:
-    """Estimate of the whole patch, for checking roots."""
+    """Estimate of the whole patch, used to check roots."""
 
     x: Float
     """(U, n) positions, in pitches."""
@@ -42,12 +42,12 @@ class PatchEstimate:
     """(U, n) standard deviations, in pitches."""
 
     def agrees(self, x: Float) -> Mask:
-        """Return a mask (U,) of the wires whose positions (U, n), in pitches, the estimate confirms."""
+        """Return a mask (U,) of the wires whose positions (U, n), in pitches, agree with the estimate."""
         return roots.agrees(np.abs(x - self.x), roots.AGREE * self.std)
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return a mask (U,) of the wires with no root, a root too rough for a press, or an undone step."""
+    """Return a mask (U,) of the wires that have no root, a root too rough for a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
@@ -89,7 +89,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each rough root unless :func:`guide` ends at the same root. The wires are not moved."""
+    """Reject each rough root unless :func:`guide` ends at the same root. The positions do not change."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()
@@ -135,7 +135,7 @@ def keep_likeliest(
 ) -> None:
     """Search for other roots of each wire, and keep the likeliest.
 
-    The search starts at the twins of the present roots, and at ``starts``. A wire stays CONVERGED only if the
+    The search starts at the twins of the current roots and at ``starts``. A wire stays CONVERGED only if the
     energy of every other root is higher by at least ``unlikely``.
 
     Args:

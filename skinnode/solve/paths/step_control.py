@@ -71,7 +71,7 @@ class Uniform:
         final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not a positive integer.
     """
 
     steps: int | None = None
@@ -107,10 +107,10 @@ class Periodic:
 
     If no cycle is given, the schedule searches for it. The search follows the path from the rest position
     with a tolerance of 1e-6, then 1e-5, 1e-4 and 1e-3, and skips samples whose first-order optimality is
-    below the tolerance. T is the median number of samples from one solve to the next, for the wire with the
-    smallest median. The search ends at the first tolerance for which T is at least 2; the path then restarts
-    from rest and is solved with this cycle and tolerance. If no tolerance yields a cycle, every sample is
-    solved with a tolerance of 1e-6.
+    below the tolerance. T is the median number of samples between successive solves of a wire, for the wire
+    with the smallest median. The search ends at the first tolerance for which T is at least 2; the path then
+    restarts from rest and is solved with this cycle and tolerance. If no tolerance yields a cycle, every
+    sample is solved with a tolerance of 1e-6.
 
     The tolerances cannot be compared directly with those of the paper. The paper does not scale its
     equations, and its ‖Jᵀr‖∞ is larger by a factor of F² than the value used here, with r = a F − 1 and
@@ -126,7 +126,7 @@ class Periodic:
         final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not a positive integer.
     """
 
     cycle: int | None = None
@@ -171,7 +171,7 @@ class Periodic:
 
 
 def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
-    """Return the shortest cycle of any wire: its median number of samples from one solve to the next.
+    """Return the shortest cycle of any wire: its median number of samples between successive solves.
 
     Args:
         solved: (T, U) bool: True where the wire was solved at the sample.
@@ -197,8 +197,8 @@ class Adaptive:
 
     Interpolated resistances do not belong to a deformation of the skin, so the path can reach a fold (det J =
     0) even if the press does not. If a wire cannot pass a fold, or its root is too rough for a press, it is
-    solved again by Levenberg-Marquardt, starting at the smoothest displacement that explains the last sample
-    (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
+    solved again with Levenberg-Marquardt, starting at the smoothest displacement that explains the last
+    sample (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
 
     One sample is enough, because the path starts at rest and ends at the last sample. If there are more
     samples, the wires with doubtful roots are also followed sample by sample, as are the wires that moved far
@@ -211,7 +211,7 @@ class Adaptive:
         final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not a positive integer.
     """
 
     points: int = 50

@@ -113,7 +113,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
     s: Float,
     b: Float,
 ) -> float:
-    """Return χ² = qᵀ Σ⁻¹ q for the normal loads q of up to nine cells, with their posterior covariance Σ.
+    """Return χ² = qᵀ Σ⁻¹ q for the normal loads q of up to nine cells with posterior covariance Σ.
 
     ``s`` (9, 9) and ``b`` (9,) are work arrays.
     """
@@ -149,7 +149,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write ``cell`` and its neighbours into ``out`` if they have an electrode; return their number."""
+    """Write those of ``cell`` and its neighbours that have an electrode into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:
@@ -406,7 +406,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
 def _dilate(  # noqa: C901 - neighbours as loops
     total: Float, near: Index, number: Index, outside: Index, added: Index
 ) -> None:
-    """Add the neighbouring cells to each contact, and number the cells of the outermost ring next to it."""
+    """Add the neighbouring cells to each contact, and number the adjacent cells of the outermost ring."""
     cells = number.size
     for cell in range(cells):
         added[cell] = 0

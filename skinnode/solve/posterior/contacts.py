@@ -77,7 +77,7 @@ class ContactFinder:
             support.
         thickness: Thickness tolerance, as a fraction of the clearance.
         outermost: Whether a contact includes the loads of adjacent cells in the outermost ring. Set this to
-            False if the prior expects equal loads everywhere, because the loads of the ring are then
+            False if the prior expects equal loads everywhere, because the loads in the ring are then
             overestimated.
     """
 
@@ -247,8 +247,8 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     ``std``. The variances are multiplied by ``doubt``, because the distribution of the load over the
     cells depends mainly on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work arrays.
 
-    Returns the cell closest to the centre, True if pulling loads were left out, and the sum of the pressing
-    loads in N.
+    Returns the cell closest to the centre, a bool that is True if pulling loads were left out, and the sum of
+    the pressing loads in N.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):

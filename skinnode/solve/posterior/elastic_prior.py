@@ -60,7 +60,7 @@ class ElasticPrior:
     cell_area_m2: float
     """Area of a cell, in m²."""
     shape: tuple[int, int]
-    """Number of cells across and along the wires; their product is Q."""
+    """Numbers of cells across and along the wires; their product is Q."""
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:

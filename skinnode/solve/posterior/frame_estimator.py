@@ -290,7 +290,7 @@ class FrameEstimator:
     def see_noise(self, ohm: Float, noise: Float, rounding_ohm: Float | None, valid: Mask | None) -> None:
         """Pass a frame to the noise estimate; the arguments are those of :meth:`NoiseEstimate.see`."""
         if self.noise_estimate is not None and self.noise_estimate.see(ohm, noise, rounding_ohm, valid):
-            self._seen = np.zeros_like(self._seen)  # the trusted field was solved with a different noise
+            self._seen = np.zeros_like(self._seen)  # the trusted field assumed a different noise
 
     def _observe(self, readings: Readings) -> Observation:
         return self._model.observe(readings, self._hyper.noise_factor)
@@ -429,8 +429,8 @@ class FrameEstimator:
         """Adapt the hyperparameters; on a layout with folds, also choose between two maxima.
 
         Annealing with a prior that expects loads everywhere can lead to a wrong maximum. On layouts with
-        folds, an annealed frame is therefore annealed again, with the loads expected where they were found.
-        The second field is kept if its −2 log posterior is lower by more than
+        folds, an annealed frame is therefore annealed again, with loads expected where they were found. The
+        second field is kept if its −2 log posterior is lower by more than
         :data:`skinnode.solve.roots.LIKELIER`.
         """
 

@@ -18,8 +18,8 @@ from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test mistakes an unmoved wire for a moved wire."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Maximum apparent movement of a coordinate of an unmoved wire, in standard deviations. With 300 coordinates
-at rest, noise exceeds this limit in one frame in 15."""
+"""Maximum apparent movement of any coordinate of an unmoved wire, in standard deviations. With 300
+coordinates at rest, noise exceeds this limit in one frame in 15."""
 KEPT: Final = 50
 """Number of frames for which a wire stays in the estimate after an unexpected movement."""
 
@@ -91,7 +91,7 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return the χ² of each wire (U,) relative to the limit above which the wire is INCONSISTENT."""
+        """Return each wire's χ² (U,), relative to the limit above which the wire is INCONSISTENT."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 

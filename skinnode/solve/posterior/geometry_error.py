@@ -56,12 +56,12 @@ def nuisances(wires: int, equations: int) -> int:
 
 
 class GeometryError:
-    """Residuals of a patch with the geometry errors g, and their derivatives with respect to g.
+    """Residuals of a patch with geometry errors g, and their derivatives with respect to g.
 
     Args:
         problem: The patch.
         elastic: Elastic prior of the patch, which provides the surface normals.
-        tolerances: Manufacturing tolerances of the patch; the standard deviations of the errors.
+        tolerances: Manufacturing tolerances of the patch, used as the standard deviations of the errors.
     """
 
     def __init__(self, problem: PatchProblem, elastic: ElasticPrior, tolerances: Tolerances) -> None:

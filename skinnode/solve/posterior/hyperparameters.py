@@ -111,9 +111,9 @@ class Hyperparameters:
             self.discs.reset()
 
     def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
-        """Return both standard deviations (U, f) in pitches, including the uncertainty of the discs.
+        """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
 
-        The first result also accounts for an additional touch that is too light to be detected.
+        ``std`` also accounts for an additional touch that is too light to be detected.
         """
         if self.discs is None:
             return std, core

@@ -36,7 +36,7 @@ class LoadCells:
     size_m: tuple[float, float]
     """Size of a cell along and across the wires, in m."""
     shape: tuple[int, int]
-    """Number of cells across and along the wires; their product is Q."""
+    """Numbers of cells across and along the wires; their product is Q."""
 
     @classmethod
     def of(cls, layout: PatchLayout) -> LoadCells:
@@ -77,8 +77,8 @@ class LoadCells:
 def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     """Return the sites of the cells, the steps along and across the wires, and the surface normals.
 
-    The lattice consists of the electrode sites and :data:`MARGIN` further rows at each edge. Each array has
-    the shape (U + 2 MARGIN, N + 2 MARGIN, 3). Sites and steps are in m. The normals are unit vectors that
+    The lattice consists of the electrode sites and :data:`MARGIN` additional rows at each edge. Each array
+    has the shape (U + 2 MARGIN, N + 2 MARGIN, 3). Sites and steps are in m. The normals are unit vectors that
     point away from the lower layer.
     """
     site = layout.upper_m

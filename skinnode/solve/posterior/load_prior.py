@@ -43,8 +43,8 @@ DISC_DOUBT: Final = 2.5
 DISC_SHARE: Final = 0.8
 """Value of :data:`SMOOTH_SHARE` for a prior with discs."""
 DISC_FAINT: Final = 0.05
-"""Limit below which the load variance that discs add to a cell is neglected, relative to the variance on
-untouched skin."""
+"""Load variance, relative to that of untouched skin, below which the discs' contribution to a cell is
+neglected."""
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation of the Gaussian that spreads squared loads over neighbouring cells, in cells. A smaller
 value improves the displacement estimate if the rubber behaves like a half-space; otherwise, the standard
@@ -112,7 +112,7 @@ class LoadPrior:
         response: (U f, 3Q) displacement per unit load, in pitches.
         doubt: Factor applied to the part of the variance that depends on the prior.
         smooth_share: Value of ``doubt`` for the 95 % interval.
-        version: Number of times that C has been rebuilt.
+        version: Number of times C has been rebuilt.
     """
 
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
@@ -230,7 +230,7 @@ class LoadPrior:
         return float(displacement @ displacement)
 
     def _own_covariance(self) -> Float:
-        """Return C as an array that may be modified; the uniform prior is shared."""
+        """Return a private array for C; replace the shared array of the uniform prior if necessary."""
         if self.covariance is self.uniform:
             self.covariance, self._root = np.empty_like(self.uniform), np.empty_like(self.uniform)
         return self.covariance

@@ -1,4 +1,4 @@
-"""MAP estimate of one frame, by Gauss-Newton steps, chord steps and annealing.
+"""MAP estimate for one frame, computed by Gauss-Newton steps, chord steps and annealing.
 
 - Chord steps start at the last field and reuse the factors of an earlier frame. A typical solve needs two
   evaluations of F and its Jacobian.
@@ -168,7 +168,7 @@ class MapEstimator:
     # -- solving ---------------------------------------------------------------------------------------
 
     def track(self, observation: Observation, members: Index) -> bool:
-        """Solve from the current displacement with the equations of the wires ``members`` (P,).
+        """Solve from the current displacement, using the equations of the wires ``members`` (P,).
 
         Returns:
             True if the solve converged; False if it found no maximum nearby.
@@ -245,7 +245,7 @@ class MapEstimator:
     def objective(
         self, observation: Observation, moved: Float | None = None, g: Float | None = None
     ) -> float:
-        """Return −2 log posterior of the current or a given field, up to a constant."""
+        """Return −2 log posterior for the current or a given field, up to a constant."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
         square = self._square(observation, self.members, moved, g)
         prior = self.roughness(moved) / self.load_prior.scale2

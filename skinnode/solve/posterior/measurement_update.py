@@ -7,7 +7,7 @@ g ~ N(0, diag(d)). Each wire has the residual r = w (a F(x) − 1) with w = 1/σ
 
     r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
-Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from x leads to
+Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from x yields
 
     x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
 
@@ -158,7 +158,7 @@ def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> N
 
 @njit
 def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """Replace F and its Jacobian by r = w (a F − 1) and the Jacobian of r."""
+    """Replace F and its Jacobian with r = w (a F − 1) and the Jacobian of r."""
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
@@ -193,7 +193,7 @@ def residuals(  # noqa: PLR0913 - a kernel: arrays by name
 def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
     free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
 ) -> None:
-    """Compute the misfit of the residuals ``r`` (U, K), and replace ``r`` by r − H g.
+    """Compute the misfit of the residuals ``r`` (U, K), and replace ``r`` with r − H g.
 
     Three results are written: the χ² of each wire into ``square_sum`` (U,); the error |Jᵢᵀ r| / ‖Jᵢ‖² of each
     coordinate i, with all other coordinates fixed, into ``move`` (U, f); and the largest error of each wire

@@ -83,8 +83,8 @@ class Posterior(FrameEstimator):
             valid: (U, K) bool: False where a reading is missing; all True by default.
             relative_noise: Relative noise of this frame only, a number or (U, K). Resistances whose noise is
                 not positive and finite are ignored.
-            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, in ohms. It is
-                combined with ``relative_noise`` as independent noise.
+            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, in ohms. This
+                noise and ``relative_noise`` are treated as independent.
 
         Returns:
             The field, with one status per wire.
@@ -108,7 +108,7 @@ class Posterior(FrameEstimator):
 
 
 def _model_std(options: PosteriorOptions) -> float:
-    """Return the forward model's standard error under the options, relative to the largest change."""
+    """Return the forward model's standard error for the given options, relative to the largest change."""
     made = options.tolerances or EXACT
     placed = PLACED * math.hypot(made.placement, made.electrode_radius)
     return math.hypot(options.model_error, placed, made.thickness, made.gain)

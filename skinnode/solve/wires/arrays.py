@@ -113,7 +113,7 @@ class SolverArrays(ArrayTable):
     turn: Annotated[Index, "1"]
     """Frame number, which determines which wires compute a new inverse despite REUSE."""
     step_limit: float
-    """Initial trust radius, pitches per coordinate."""
+    """Initial trust radius, in pitches per coordinate."""
     point: Annotated[Float, "3E"]
     """Positions of the electrodes that have unknowns."""
     raw: Annotated[Float, "3E K"]
@@ -215,7 +215,7 @@ class FrameArrays(ArrayTable):
         )
 
     def set_codes(self, codes: CodeMap) -> None:
-        """Set the mapping of codes to resistances."""
+        """Set the mapping from codes to resistances."""
         self.baseline_ohm[:], self.rounding_ohm[:] = codes.baseline_ohm, codes.rounding_ohm
         self.code_gain[:] = 1.0 if codes.gain is None else codes.gain
         self.code_map[:] = codes.lo, codes.step, codes.steps, codes.relative_noise

@@ -16,8 +16,7 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Limits of the scaled resistance a. All plausible values are within these limits; at rest, a is about
-1 / (N M)."""
+"""Limits on the scaled resistance a. All plausible values are within them; at rest, a is about 1 / (N M)."""
 
 
 @njit_part

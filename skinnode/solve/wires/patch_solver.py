@@ -1,4 +1,4 @@
-"""Solver for all wires of a patch: its buffers, and one compiled function for all stages of a frame.
+"""Solver for all wires of a patch: buffers, and a compiled function that runs all stages of a frame.
 
 All stages run in a single call, because passing arguments from Python to compiled code takes longer than most
 of the stages.
@@ -47,7 +47,7 @@ STORE: Final = 32
 # Flags that a call returns, combined with bitwise OR
 ALL_GOOD: Final = 1
 INCOMPLETE: Final = 2
-"""A new trusted solution was stored in which the weight of some equation was 0."""
+"""A new trusted solution was stored in which at least one equation has weight 0."""
 
 REST_TOLERANCE: Final = 1e-9
 """Tolerance of the solve at the rest position, where the residual consists only of rounding errors."""

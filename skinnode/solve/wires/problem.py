@@ -24,7 +24,7 @@ TRUST_SHARE: Final = 0.25
 """Initial trust radius, relative to the smallest clearance between the layers at rest.
 
 Within this radius, F is nearly linear. From one frame of a live stream to the next, the skin moves less than
-the radius.
+this radius.
 """
 
 
@@ -72,7 +72,7 @@ class PatchProblem:
 
     @property
     def step_limit(self) -> float:
-        """Initial trust radius, pitches per coordinate."""
+        """Initial trust radius, in pitches per coordinate."""
         return TRUST_SHARE * float(self.clearance.min())
 
     def displacement_m(self, x: Float) -> Float:

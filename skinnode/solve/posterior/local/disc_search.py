@@ -98,7 +98,7 @@ class DiscPrior:
         self.spread = np.zeros(len(self._prior.response))
 
     def reset(self) -> None:
-        """Forget the discs."""
+        """Discard the discs."""
         self.discs = np.empty((0, PARAMETERS))
         self.spread[:] = 0.0
 

@@ -56,13 +56,13 @@ halved."""
 WORTH: Final = 0.05
 """Minimum gain in log-likelihood for a step to be accepted."""
 PARAMETERS: Final = 5
-"""Number of parameters of a disc: row, column, ln R, ln a, ln β."""
+"""Number of parameters per disc: row, column, ln R, ln a, ln β."""
 LOADS: Final = 4
-"""Number of loads of a cell: shear along and across the wire, normal load, normal load on a layer."""
+"""Number of loads per cell: shear along and across the wire, normal load, normal load on a layer."""
 
 
 class Effects(NamedTuple):
-    """Effects of the loads of n cells on the data of one frame."""
+    """Effects of n cells' loads on the data of one frame."""
 
     place: Float
     """(n, 2) row and column of each cell."""

@@ -83,7 +83,7 @@ class Posterior(FrameEstimator):
             valid: (U, K) bool: False where a reading is missing; all True by default.
             relative_noise: Relative noise of this frame only, a number or (U, K). Resistances whose noise is
                 not positive and finite are ignored.
-            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, in ohms. This
+            rounding_ohm: (U, K) standard deviation of the quantization error of the codes, in ohms. This
                 noise and ``relative_noise`` are treated as independent.
 
         Returns:

@@ -1,9 +1,9 @@
 """Precision of a field: whether its standard deviations are within the user's limits.
 
-The default limit for the displacement is the root sum square of two terms: :data:`MULTIPLE` times the
-standard deviation of the exact inverse at rest, and a term for the manufacturing tolerances. It is at most
-:data:`MOST` times the clearance. A healthy patch stays below the default limit. Lost readings, or more noise
-than stated, can raise the standard deviations above it.
+The default limit for the displacement is the root-sum-square of two terms: :data:`MULTIPLE` times the
+standard deviation of the exact inverse at rest, and a term for the manufacturing tolerances. This limit is at
+most :data:`MOST` times the clearance. A healthy patch stays below the default limit. Lost readings, or more
+noise than stated, can raise the standard deviations above it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ In 2,640 simulated fields of healthy patches (ten layouts, relative noise 3e-6 t
 the largest ratio was 12.2.
 """
 MOST: Final = 0.3
-"""Upper bound of the default limit, in clearances; larger standard deviations mean that the prior dominates
+"""Upper bound on the default limit, in clearances; larger standard deviations mean that the prior dominates
 the displacement.
 
 Of the 2,640 fields described at :data:`MULTIPLE`, only those with h = 1 and a relative noise of 1e-3 exceeded
@@ -55,11 +55,11 @@ class PrecisionLimits:
     """Maximum standard deviations in a precise field; inf for no limit."""
 
     std_m: float
-    """Limit for each coordinate of the displacement, metres."""
+    """Limit for each coordinate of the displacement, in metres."""
     force_std_n: float
-    """Limit for each calibrated normal force, N."""
+    """Limit for each calibrated normal force, in N."""
     uncalibrated_force_std_n: float
-    """Limit for each uncalibrated normal force, N."""
+    """Limit for each uncalibrated normal force, in N."""
 
 
 def limits_of(layout: PatchLayout, options: TrackerOptions) -> PrecisionLimits:

@@ -1,10 +1,10 @@
-"""Checks of the roots found by the exact inverse; the posterior confirms, replaces or rejects them.
+"""Checks the roots found by the exact inverse; the posterior confirms, replaces or rejects them.
 
 A root is doubtful in three cases: an electrode moved too far since the previous frame, the displacement is
 too rough for a press, or a press can move the wire across a fold, where two roots of F = b merge. Near a
-fold, the exact inverse cannot tell which of two roots is the correct one. A wire without a root is doubtful
-too. The posterior, which estimates the positions from all wires of the patch, decides about each doubtful
-root. :mod:`skinnode.solve.roots` defines the thresholds.
+fold, the exact inverse cannot tell which of two roots is correct. A wire without a root is also doubtful. The
+posterior, which estimates the positions from all wires of the patch, decides on each doubtful root.
+:mod:`skinnode.solve.roots` defines the thresholds.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after one that missed its deadline.
+"""Number of frames without a posterior solve after a solve that missed its deadline.
 
 Without this pause, a posterior that misses every deadline would delay the other patches on the same thread by
 2 ms per frame.
 """
 APART: Final = 3.0
-"""Factor for the distance between a confirmed root and the posterior estimate, for wires that a press can
-move across a fold.
+"""Factor applied to the distance between a confirmed root and the posterior estimate, for wires that a press
+can move across a fold.
 
 The product is added in quadrature to the standard deviation of the root, because the posterior cannot
 distinguish two roots that are very close to each other.
 """
 NEAR_FOLD: Final = 2.0
-"""Factor for the standard deviation of a posterior estimate that replaces a root, for wires that a press can
-move across a fold."""
+"""Factor applied to the standard deviation of a posterior estimate that replaces a root, for wires that a
+press can move across a fold."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Check of the fields of an exact tracker against the posterior estimate of the same patch.
+    """Checks the fields of an exact tracker against the posterior estimate of the same patch.
 
     Each exact tracker needs its own gate.
 
@@ -68,9 +68,9 @@ class RootGate:
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # remaining number of frames without a posterior solve
         self.hurried = False
-        """Whether the last call of :meth:`check` had too little time to check all doubtful roots."""
-        self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, m
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # addition to the standard deviation, m; see APART
+        """Whether the last call to :meth:`check` had too little time to check all doubtful roots."""
+        self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, in m
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # added to the standard deviation, in m; see APART
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._options = options
@@ -123,8 +123,10 @@ class RootGate:
 
         Args:
             field: Field of the exact tracker.
-            start: Start of the tracker's update, on the clock :func:`skinnode.process.clock.perf_counter`, s.
-            again: True if this frame was already checked, and was then solved again without some readings.
+            start: Start time of the tracker's update, in s, on the clock
+                :func:`skinnode.process.clock.perf_counter`.
+            again: True if this frame has already been checked and was then solved again without some
+                readings.
         """
         doubtful: Mask | None = None
         self.hurried = False
@@ -185,7 +187,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Reject all doubtful roots, for lack of time for a posterior solve."""
+        """Reject all doubtful roots, because there is no time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0
@@ -226,7 +228,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # updated by the next call of _keep_apart
+        self._any_apart = True  # updated by the next call to _keep_apart
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)

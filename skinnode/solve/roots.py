@@ -1,6 +1,6 @@
 """Criteria for choosing among the roots of F = b, and their thresholds.
 
-The equations F = b of a wire have several roots, and the skin is at only one of them. The roots on either
+The equations F = b of a wire have several roots, but the skin is at only one of them. The roots on either
 side of a fold (a surface where det J = 0) are called twins; they merge at the fold. Five criteria identify
 the correct root: the sign of det J, the distance from the rest position, the roughness, the energy compared
 with other roots of the wire, and the posterior estimate of the whole patch.
@@ -70,7 +70,7 @@ a wrong root for one wire in 30.
 BLIND: Final = 1e7
 """Conditioning of a wire above which the resistances do not determine the positions of its electrodes.
 
-Only two kinds of wires exceed this limit: wires on a symmetry line of the layout, and wires at least 1.5
+Only two kinds of wire exceed this limit: wires on a symmetry line of the layout, and wires at least 1.5
 pitches above aligned lower wires.
 """
 NEARLY_BLIND: Final = 1e5
@@ -120,7 +120,7 @@ Only the second half of a long path is tested for smoothness, because a path tha
 may return to the correct root.
 """
 ROOT_RESIDUAL: Final = 1e-9
-"""RMS of F/b − 1 up to which the end of a path counts as a root, whatever the solver's status.
+"""RMS of F/b − 1 up to which the end of a path counts as a root, regardless of the solver's status.
 
 If J is nearly singular at a root, the solver does not report CONVERGED.
 """
@@ -145,7 +145,7 @@ UNLIKELY: Final = 4.0
 the wire. In 3060 simulated pairs of roots, no wrong root had an energy more than 2.6 below that of the
 correct root."""
 UNLIKELY_BLIND: Final = 16.0
-"""As :data:`UNLIKELY`, for wires whose conditioning exceeds :data:`NEARLY_BLIND`.
+"""Like :data:`UNLIKELY`, but for wires whose conditioning exceeds :data:`NEARLY_BLIND`.
 
 The margin is larger because the search may miss roots of these wires.
 """
@@ -153,16 +153,15 @@ The margin is larger because the search may miss roots of these wires.
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
 REFEREE_NOISE: Final = 1e-5
-"""Lower limit of the relative noise assumed by a posterior that checks roots.
+"""Lower limit on the relative noise assumed by a posterior that checks roots.
 
 With less noise, the posterior could converge to the same wrong root as the exact inverse.
 """
 AGREE: Final = 6.0
-"""Maximum distance of a root from the posterior estimate, in standard deviations, for the root to be
-confirmed."""
+"""Maximum distance from the posterior estimate at which a root is confirmed, in standard deviations."""
 NEAR: Final = 0.25
-"""First correction to an electrode position, in clearances, above which the posterior is computed by
-annealing."""
+"""Size of the first correction to an electrode position, in clearances, above which the posterior is computed
+by annealing."""
 FAR: Final = 0.1
 """Movement of an electrode, in clearances, after which the posterior estimate is compared with an estimate
 annealed from the rest position.
@@ -198,7 +197,7 @@ def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
 
 
 def blind_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
-    """Return a mask (U,) of the wires whose electrode positions the resistances do not determine."""
+    """Return a mask (U,) of the wires whose electrode positions are not determined by the resistances."""
     return np.asarray(wire_std(layout, 1.0, normal_only) > BLIND)
 
 
@@ -234,8 +233,8 @@ def rough_at_path_end(roughness: Float, displacement: Float, step_limit: float) 
 
     Args:
         roughness: (U,) roughness √(uᵀ C⁻¹ u) of each displacement u.
-        displacement: (U, n) displacements, pitches.
-        step_limit: Standard deviation of each coordinate according to C, pitches.
+        displacement: (U, n) displacements, in pitches.
+        step_limit: Standard deviation of each coordinate according to C, in pitches.
     """
     size = np.sqrt((displacement**2).sum(axis=1)) / step_limit
     return np.asarray(roughness > ROUGH_AT_PATH_END * size)

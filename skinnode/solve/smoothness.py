@@ -17,21 +17,21 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. On the simulated staggered layout, the guided start found 3204 of 3209 roots
-with a length of 1 pitch, and fewer with 0.7 or 1.5 pitches."""
+"""Correlation length ℓ, in pitches. On the simulated staggered layout, the guided start found 3204 of 3209
+roots with a length of 1 pitch, and fewer with 0.7 or 1.5 pitches."""
 ROUGH_SHARE: Final = 1e-3
-"""Relative increase in the diagonal of C, which keeps C from being numerically singular."""
+"""Relative increase in the diagonal of C that keeps C from being numerically singular."""
 
 
 class Smoothness:
-    """Smoothness model of every upper wire of a patch.
+    """Smoothness model for every upper wire of a patch.
 
     Args:
         problem: The patch.
 
     Attributes:
-        covariance: (U, n, n) C for the n = 3N coordinates of each wire, pitches².
-        whitening: (U, N, N) inverse Cholesky factor of C for one coordinate, 1/pitch.
+        covariance: (U, n, n) C for the n = 3N coordinates of each wire, in pitch².
+        whitening: (U, N, N) inverse Cholesky factor of C for one coordinate, in pitch⁻¹.
     """
 
     def __init__(self, problem: PatchProblem) -> None:
@@ -42,7 +42,7 @@ class Smoothness:
         """Return the roughness √(uᵀ C⁻¹ u) of each wire's displacement u.
 
         Args:
-            x: (U, n) electrode positions, pitches.
+            x: (U, n) electrode positions, in pitches.
 
         Returns:
             (U,) roughness, dimensionless.

@@ -1,11 +1,11 @@
-"""Starting points for solves without an earlier solution nearby.
+"""Starting points for solves that have no earlier solution nearby.
 
 ``guided_start`` computes the maximum a posteriori estimate of a displacement, with a smoothness prior and
 with noise that decreases from one Gauss-Newton step to the next (Tarantola 2005, section 3.4).
 
 ``near_twin`` estimates the twin of a root, which is the root on the other side of the nearest fold. Let σ be
-the smallest singular value of J at the root x, with the left vector w and the right vector v. To second
-order, x + α v is a root if σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
+the smallest singular value of J at the root x, with left singular vector w and right singular vector v. To
+second order, x + α v is a root if σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
 (Golubitsky & Schaeffer 1985, chapter I.3).
 """
 
@@ -29,10 +29,10 @@ NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
 With one per decade, the guided start fails on an additional 1 % of simulated wires.
 """
 POWER_STEPS: Final = 8
-"""Number of inverse iterations for the smallest singular value of J. The next singular value is about three
-times as large, so the iteration converges quickly."""
+"""Number of inverse iterations used to find the smallest singular value of J. The next singular value is
+about three times as large, so the iteration converges quickly."""
 DIFFERENCE: Final = 1e-4
-"""Step of the central difference of two Jacobians in either direction, pitches. It is much larger than
+"""Step in either direction for the central difference of two Jacobians, in pitches. It is much larger than
 eps^(1/3) = 6e-6, which makes rounding errors negligible."""
 
 
@@ -43,11 +43,11 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         problem: The patch.
         wire: Index of the upper wire.
         a: (K,) scaled resistances R · gain of the wire.
-        covariance: (n, n) prior covariance of the displacement of the wire, pitches².
+        covariance: (n, n) prior covariance of the displacement of the wire, in pitch².
 
     Returns:
-        The position (n,) in pitches, which is the rest position if the iteration fails; and the number of
-        evaluations of F and J.
+        The position (n,) in pitches (the rest position if the iteration fails), and the number of evaluations
+        of F and J.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()
@@ -75,8 +75,8 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 ) -> int:
     """Update ``x`` by one Gauss-Newton step per noise level σ: x ← rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
 
-    Here, y = J (x − rest) − r. The arrays after ``noises`` are scratch. Returns the number of evaluations of
-    F and J.
+    Here, y = J (x − rest) − r. The arguments after ``noises`` are work arrays. Returns the number of
+    evaluations of F and J.
     """
     n, equations = jt.shape
     for level in range(noises.size):
@@ -121,12 +121,12 @@ def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Floa
 
     Args:
         problem: The patch.
-        x: (n,) root of a wire, pitches.
+        x: (n,) root of a wire, in pitches.
         a: (K,) scaled resistances R · gain of the wire.
         inverse: (n, K) ∂x/∂r at ``x``.
 
     Returns:
-        (n,) position of the twin, pitches; not finite if there is none to second order.
+        (n,) position of the twin, in pitches; not finite if no twin exists to second order.
     """
     w = np.ones(a.size)
     for _ in range(POWER_STEPS):

@@ -1,7 +1,7 @@
 """Tracker that estimates the displacement field of a patch for each frame of a live stream.
 
-The method ``exact`` solves each upper wire separately. The method ``posterior`` estimates the whole patch,
-with an elastic prior. The default method, ``auto``, selects ``exact`` if the noise is low enough, and
+The method ``exact`` solves each upper wire separately. The method ``posterior`` estimates the whole patch at
+once, using an elastic prior. The default method, ``auto``, selects ``exact`` if the noise is low enough, and
 ``posterior`` otherwise. The posterior also checks doubtful roots found by the exact method
 (:mod:`skinnode.solve.root_gate`).
 
@@ -39,7 +39,7 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Invalid code, sent by no converter, that replaces the code of a reading to be ignored."""
+"""Invalid code, never sent by a converter, that replaces the code of a reading to be ignored."""
 EXACT_STD: Final = 0.0025
 """RMS standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` selects ``exact``.
 
@@ -151,8 +151,8 @@ class Tracker:
         position, with an infinite standard deviation and a status other than CONVERGED.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False for missing readings; default: all True.
+            frame_ohm: (U, K) resistances, in ohms; values that are not positive and finite are ignored.
+            valid: (U, K) bool: False for missing readings; default: all True.
             relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
                 default: the option ``relative_noise``. A resistance is ignored if its standard deviation is
                 not positive and finite.
@@ -255,7 +255,7 @@ class Tracker:
         return field
 
     def _finished(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of a solved frame with the results of the detector and its precision."""
+        """Return the field of a solved frame with ``precise`` and the detector's results added."""
         self._follow_noise()
         field = self._judged(field)
         return field if self._rest is None else self._rest.add(field)

@@ -1,4 +1,4 @@
-"""Template of all HTML pages, and escaping of untrusted text in them."""
+"""Template for all HTML pages, and a function that escapes untrusted text in them."""
 
 from __future__ import annotations
 
@@ -37,5 +37,5 @@ def page(title: str, style: str, body: Iterable[str]) -> str:
 
 
 def escaped(text: object) -> str:
-    """Return ``text`` with non-printable characters and the special characters of HTML escaped."""
+    """Return ``text`` with non-printable characters and HTML special characters escaped."""
     return html.escape(printable_lines(str(text)))

@@ -2,16 +2,16 @@ r"""Escapes non-printable characters in untrusted text.
 
 Text from a device, a file, a recording or the command line is untrusted. It is handled as follows:
 
-* Text from a bus or an EDS becomes one printable line when it is decoded (:func:`printable`). Only
+* Text from a bus or an EDS is converted to one printable line when it is decoded (:func:`printable`). Only
   ``od --json``, DCF files and comparisons use the original bytes.
 * ``skinnode.config`` rejects names in hand.toml that are not printable.
-* All output of commands passes through :class:`PrintableStream` or, for output by rich, through the console
-  of ``skinnode.cli``. This covers file names and arguments, too.
-* In HTML pages, the special characters of HTML are escaped as well.
+* All command output passes through :class:`PrintableStream` or, for output by rich, through the console of
+  ``skinnode.cli``. This includes file names and arguments.
+* In HTML pages, HTML special characters are also escaped.
 
 :meth:`str.isprintable` defines which characters are printable. Control characters, surrogates and format
-characters, such as those that reverse the text direction, are not. They are replaced with Python escape
-sequences such as ``\x1b`` and ``\u202e``.
+characters, such as those that reverse the text direction, are not printable. They are replaced with Python
+escape sequences such as ``\x1b`` and ``\u202e``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Number of characters to which untrusted text is truncated. All valid names are shorter."""
+"""Maximum length of untrusted text, in characters; longer text is truncated. All valid names are shorter."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
@@ -43,7 +43,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 def printable_lines(text: str) -> str:
     """Return ``text`` with non-printable characters escaped, except newlines and tabs.
 
-    This is meant for messages that contain untrusted text.
+    This function is meant for messages that contain untrusted text.
     """
     return text if text.isprintable() else _SUSPECT_IN_LINES.sub(_escaped, text)
 
@@ -54,7 +54,7 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """Wrapper of a text stream, such as stdout, that escapes non-printable characters.
+    """Wrapper around a text stream, such as stdout, that escapes non-printable characters.
 
     Rich bypasses the wrapper: it writes to the stream in the attribute ``rich_proxied_file``.
     """

@@ -1,8 +1,8 @@
 """Access to CAN interfaces: ports, receiving threads and log files.
 
 ``port`` sends and receives frames, and reopens failed interfaces. ``socketcan`` receives batches of frames
-with recvmmsg(2), and ``hardware_time`` converts their hardware timestamps. ``multicast`` exchanges frames
-with python-can's interface udp_multicast, also in batches; ``sendto`` sends its packets, and
+with recvmmsg(2), and ``hardware_time`` converts their hardware timestamps. ``multicast`` exchanges frames in
+batches and is compatible with python-can's udp_multicast interface; ``sendto`` sends its packets, and
 ``socket_options`` sets up its sockets. ``receiver`` contains the receiving threads. ``frame_log`` and
 ``frame_log_reader`` write and read log files.
 

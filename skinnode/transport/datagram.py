@@ -39,7 +39,7 @@ def free_channel() -> str:
 
 
 class DatagramPort(CanPort):
-    """Port that only receives, from a UDP bus. The ``channel`` of a UDP bus is a UDP port number."""
+    """Receive-only port on a UDP bus. The ``channel`` of a UDP bus is a UDP port number."""
 
     def _open(self) -> can.BusABC:
         try:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 class Frame(NamedTuple):
     """Received CAN frame.
 
-    ``t_ns`` is the arrival time on the monotonic clock, ns. ``data`` is empty for a remote frame.
+    ``t_ns`` is the arrival time on the monotonic clock, in ns. ``data`` is empty for a remote frame.
     """
 
     can_id: int

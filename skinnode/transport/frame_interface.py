@@ -1,4 +1,4 @@
-"""Methods with which an interface exchanges frames directly, not as ``can.Message``."""
+"""Interface methods that exchange frames directly instead of as ``can.Message``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from skinnode.transport.frame import Frame
 
 @runtime_checkable
 class FrameInterface(Protocol):
-    """Interface with methods for frames, which :class:`~skinnode.transport.CanPort` then uses.
+    """Interface with direct frame methods, which :class:`~skinnode.transport.CanPort` uses if present.
 
     On a simulated bus, converting frames to ``can.Message`` and back would take longer than everything else.
     A python-can interface may provide these methods; for udp_multicast,
@@ -28,7 +28,7 @@ class FrameInterface(Protocol):
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames.
 
         Raises:
@@ -39,18 +39,18 @@ class FrameInterface(Protocol):
 
 @runtime_checkable
 class SignallingInterface(FrameInterface, Protocol):
-    """Interface that announces frames by a call, so that no thread has to wait for them.
+    """Interface that announces frames by calling a function, so that no thread has to wait for them.
 
     On a simulated bus in virtual time, waking a thread for each batch of frames would take longer than
     receiving them.
     """
 
     def call_on_arrival(self, function: Callable[[], object]) -> None:
-        """Call ``function`` from now on when frames have arrived. It must not wait.
+        """Call ``function``, which must not wait, whenever frames have arrived.
 
         A frame that arrives before the time given to :meth:`hold_until` is announced at that time.
         """
 
     def hold_until(self, t_ns: int) -> None:
-        """Announce no frames before monotonic time ``t_ns``, so that they are fetched together."""
+        """Defer announcements until monotonic time ``t_ns``, so that frames are fetched together."""
         ...

@@ -4,9 +4,9 @@ If the process is killed, no frame written before the last :meth:`FrameLog.flush
 writer buffers up to 128 kB, and completes the file header only when it stops. Flushing a BLF file therefore
 stops the writer, and a new writer appends the next frame.
 
-An ASC file contains its start time as local time without a time zone, and the time of each frame since then.
-The start time is a whole second here, because python-can's writer and reader disagree about its fractions. An
-ASC file does not contain the identifier and data of an error frame.
+An ASC file contains its start time as local time without a time zone, and the time of each frame relative to
+the start. The start time written here is a whole second, because python-can's writer and reader disagree
+about fractions of a second. An ASC file does not contain the identifiers or data of error frames.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from skinnode.errors import ConfigError
 from skinnode.transport.frame import Frame
 
 SUFFIXES: Final = (".log", ".blf")
-"""Suffixes of logs that can be recorded: a file whose process was killed is readable up to the last flush."""
+"""Suffixes of logs that can be recorded: if the process is killed, the file is readable up to the last
+flush."""
 WRITABLE: Final = (*SUFFIXES, ".asc")
 """Suffixes of logs that can be written."""
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Maximum size of a BLF container before compression, bytes. Less is written between two flushes, so no frame
-is split between containers."""
+"""Maximum size of a BLF container before compression, in bytes. Less is written between two flushes, so no
+frame is split between containers."""
 
 
 class LoggedFrame(NamedTuple):
@@ -37,7 +38,7 @@ class LoggedFrame(NamedTuple):
 
     frame: Frame
     channel: str
-    """Name of the channel or, if read from a BLF or ASC file, its number counted from 0."""
+    """Name of the channel or, if read from a BLF or ASC file, its number, counted from 0."""
     sent: bool
     """Whether the recording program itself sent the frame."""
 
@@ -68,7 +69,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame. Until the next :meth:`flush`, a crash may lose it."""
+        """Write a frame. Until the next :meth:`flush`, a crash can lose it."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open(frame.t_ns)
@@ -90,7 +91,7 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass all frames to the operating system, so that they survive the end of the process.
+        """Pass all frames to the operating system, so that they are not lost if the process ends.
 
         Args:
             to_disk: Whether to wait until the frames are on the disk, so that they survive a power failure.
@@ -154,7 +155,7 @@ def create_binary(path: Path) -> BinaryIO:
 
 @contextlib.contextmanager
 def _errors_of(path: Path) -> Iterator[None]:
-    """Convert errors of opening a new file to ConfigError."""
+    """Convert errors raised while opening a new file to ConfigError."""
     try:
         yield
     except FileExistsError:

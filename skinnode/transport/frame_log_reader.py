@@ -28,7 +28,7 @@ from skinnode.transport.frame_log import WRITABLE, LoggedFrame
 READABLE: Final = WRITABLE
 """Suffixes of logs that can be read."""
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damaged parts that are described. Further ones are only counted."""
+"""Maximum number of damaged parts that are described. Further damaged parts are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Damage:
     line: int | None
     """Line number, counted from 1; None for a BLF file."""
     offset: int
-    """Offset from the beginning of the file, bytes."""
+    """Offset from the beginning of the file, in bytes."""
     what: str
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ class _Container(NamedTuple):
     """Container of a BLF file."""
 
     end: int
-    """File offset from which to search for the next container, bytes."""
+    """File offset from which to search for the next container, in bytes."""
     objects: bytes | None
     """Readable part of the content; None if nothing is readable."""
     intact: bool = False
@@ -106,10 +106,10 @@ class FrameLogReader:
     # --- ASC
 
     def _asc(self) -> Iterator[LoggedFrame]:
-        """Yield the frames of an ASC file. python-can parses the file and skips lines that are no frames."""
+        """Yield the frames of an ASC file. python-can parses the file and skips lines that are not frames."""
         head = self._file.read(_ASC_HEAD_BYTES)
         if re.search(rb"^date\s", head, re.MULTILINE | re.IGNORECASE) is None:
-            self._complain(1, 0, f"no ASC file: {_shown(head[:16])}")
+            self._complain(1, 0, f"not an ASC file: {_shown(head[:16])}")
             return
         self._file.seek(0)
         text = io.TextIOWrapper(self._file, encoding="ascii", errors="replace")
@@ -117,7 +117,7 @@ class FrameLogReader:
             for message in can.ASCReader(text, relative_timestamp=False):
                 yield _numbered_frame(message)
         except Exception as error:  # python-can raises various exceptions for invalid data
-            self._complain(None, 0, f"unreadable from some line on ({type(error).__name__}: {error})")
+            self._complain(None, 0, f"unreadable from an unknown line on ({type(error).__name__}: {error})")
 
     # --- BLF
 
@@ -153,8 +153,8 @@ class FrameLogReader:
     def _container(self, data: mmap.mmap, at: int) -> _Container:
         """Return the BLF container at file offset ``at``.
 
-        The length of a damaged container may be wrong, so the search for the next one starts directly after
-        its header.
+        The length of a damaged container may be wrong, so the search for the next container starts directly
+        after its header.
         """
         _, _, _, size, _ = _OBJECT.unpack_from(data, at)
         begin, end = at + _CONTAINER_HEAD_BYTES, at + size
@@ -264,7 +264,7 @@ def _shown(data: bytes) -> str:
 
 _ASC_HEAD_BYTES: Final = 1024
 
-# --- BLF: sizes are those of python-can's can/io/blf.py
+# --- BLF: sizes are from python-can's can/io/blf.py
 
 _OBJECT: Final = struct.Struct("<4sHHLL")  # "LOBJ", header size, version, object size, object type
 _CONTAINER_HEAD_BYTES: Final = _OBJECT.size + 16

@@ -5,16 +5,16 @@ attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgp
 sending it. However, everything except the timestamp and the data recurs in a program's packets, so python-can
 converts each kind of frame only once:
 
-- To send a frame, its data is inserted into a packet that python-can has packed for this identifier and
+- When a frame is sent, its data is inserted into a packet that python-can has packed for this identifier and
   length.
 - A received packet is compared, without its timestamp and data, with the packets that python-can has already
-  unpacked. If the packet differs from all of these or has another layout, python-can unpacks it.
+  unpacked. If the packet differs from all of these or has a different layout, python-can unpacks it.
 
-Like python-can's interface, this one has no arbitration and does not guarantee delivery or order: it is meant
-for tests of programs, not of a bus under load.
+Like python-can's interface, this interface has no arbitration and does not guarantee delivery or order: it is
+meant for testing programs, not for testing a bus under load.
 
-Packets are received in batches, with kernel timestamps and the kernel's drop counter. A sender also receives
-its own packets. The sender skips these packets, which it identifies by a tag in the channel field. python-can
+Packets are received in batches, with kernel timestamps and the kernel's drop counter. An endpoint also
+receives its own packets. It identifies them by a tag in the channel field and skips them. python-can
 transmits this field but does not use it.
 """
 
@@ -44,11 +44,11 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _DELIVERY_S: Final = 0.05
-"""Maximum time (s) that the kernel needs to deliver a frame. The longest time observed was 28 ms."""
+"""Maximum time (s) for the kernel to deliver a frame. The longest time observed was 28 ms."""
 
 _BATCH_PACKETS: Final = 256
 _PACKET_BYTES: Final = 4096
-"""Maximum packet length, bytes, as in python-can. Longer packets are truncated."""
+"""Maximum packet length in bytes, as in python-can. Longer packets are truncated."""
 
 _STAMP: Final = struct.Struct("@qq")  # struct timespec: s and ns
 _DROPS: Final = struct.Struct("@I")
@@ -57,7 +57,7 @@ _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMP.size)
 _COUNTED_BYTES: Final = _STAMPED_BYTES + socket.CMSG_SPACE(_DROPS.size)
 _HEAD: Final = b"\x8b\xa9timestamp\xcb"  # a map with 11 entries, the first of which is a 64-bit float
 _HEAD_BYTES: Final = len(_HEAD) + 8
-"""Length of a packet's head up to the end of the timestamp, bytes."""
+"""Length of a packet up to the end of the timestamp, in bytes."""
 _DATA: Final = b"\xa4data\xc4"  # data key and byte-string type; followed by the length (u8)
 
 
@@ -70,7 +70,7 @@ _TAG_BYTES: Final = len(new_tag())
 _TAG_AT: Final = pack_message(
     can.Message(arbitration_id=0x7FF, is_extended_id=False, channel=new_tag())
 ).index(b"skinnode-")
-"""Offset of the tag in this program's packets with identifiers of 0x100 or higher, bytes."""
+"""Offset of the tag in this program's packets with identifiers of 0x100 or higher, in bytes."""
 _TAG_END: Final = _TAG_AT + _TAG_BYTES
 
 _RECORD: Final = struct.Struct(
@@ -83,7 +83,7 @@ _MOST_KINDS: Final = 4096
 """Maximum number of packet kinds to remember. Sixteen patches send 100 kinds."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible lead of a frame's timestamp over the time at which the frame is read, ns."""
+"""Maximum plausible lead of a frame's timestamp over the time at which the frame is read, in ns."""
 
 
 class _Kind(NamedTuple):
@@ -97,7 +97,7 @@ class _Kind(NamedTuple):
 
 
 class MulticastSocket:
-    """Endpoint on a multicast group. Any thread may send, but only one thread may receive.
+    """Endpoint in a multicast group. Any thread may send, but only one thread may receive.
 
     Args:
         bus: Open python-can bus. The endpoint takes over its socket and shuts the bus down.
@@ -115,7 +115,7 @@ class MulticastSocket:
         self._batch = MessageBatch(_BATCH_PACKETS, _PACKET_BYTES, _COUNTED_BYTES)
         self._waiting: list[Frame] = []
         self.dropped = 0
-        """Number of packets, including the endpoint's own, dropped because of a full receive buffer."""
+        """Number of packets, including the endpoint's own, dropped because the receive buffer was full."""
         self.malformed = 0
         """Number of received packets that were not CAN frames."""
         self._sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
@@ -165,7 +165,7 @@ class MulticastSocket:
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames.
 
         Raises:

@@ -1,8 +1,8 @@
 """CAN bus endpoint with the same behaviour on every type of interface.
 
-Errors of python-can are converted to :class:`~skinnode.errors.BusError` with a one-line message. Arrival
-times are on the host's monotonic clock. The interfaces virtual, udp_multicast and socketcan provide
-wall-clock timestamps, which are converted.
+python-can errors are converted to :class:`~skinnode.errors.BusError` with a one-line message. Arrival times
+are on the host's monotonic clock. The interfaces virtual, udp_multicast and socketcan provide wall-clock
+timestamps, which are converted.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames. It holds 4 s of traffic from a
-fully loaded 1 Mbit/s bus."""
+"""Capacity of an endpoint's receive queue on python-can's virtual bus, in frames. It holds 4 s of traffic
+from a fully loaded 1 Mbit/s bus."""
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum plausible age of a timestamp, s. An older timestamp, or one in the future, does not come from this
-machine's wall clock and is replaced by the time at which the frame is read."""
+"""Maximum plausible age of a timestamp, in s. An older timestamp, or one in the future, does not come from
+this machine's wall clock and is replaced by the time at which the frame is read."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Error codes of the kernel for an interface that has gone down. The kernel reports this only once, to the
-next send or receive call."""
+"""Kernel error codes for an interface that has gone down. The kernel reports this only once, to the next send
+or receive call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
@@ -56,7 +56,7 @@ def is_interface(config: BusConfig) -> bool:
 
 
 def allowed_interfaces(config: BusConfig) -> str:
-    """Return a text that lists the names of all interfaces and suggests the closest match."""
+    """Return text that lists the names of all interfaces and suggests the closest match."""
     known = ", ".join(sorted(can.VALID_INTERFACES))
     near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
     return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"
@@ -128,7 +128,7 @@ def _where(config: BusConfig) -> str:
 class CanPort(Closing):
     """Endpoint on a CAN bus, open until :meth:`close` is called or a ``with`` block ends.
 
-    An endpoint does not receive its own frames. Configuration files and environment variables of python-can
+    An endpoint does not receive its own frames. python-can's configuration files and environment variables
     are ignored.
 
     Threads: any thread may send, but only one thread may receive.
@@ -150,7 +150,7 @@ class CanPort(Closing):
         self._sent = self._received = self._errors = self._undelivered = 0
         self._dropped_before = self._malformed_before = 0  # counters of sockets closed by reopen()
         self._away = False
-        # The same tag after reopen(), because the kernel may deliver a frame late.
+        # Keep the same tag after reopen(), because the kernel may deliver a frame late.
         self._tag = new_tag()
         self._connect()
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
@@ -183,9 +183,9 @@ class CanPort(Closing):
 
     @property
     def signalling(self) -> SignallingInterface | None:
-        """Interface that announces arriving frames by a call; None if a thread has to wait for them.
+        """Interface that announces arriving frames by function call; None if a thread must wait for them.
 
-        After :meth:`reopen`, it is another object.
+        After :meth:`reopen`, this is a different object.
         """
         return self._signalling
 
@@ -215,7 +215,7 @@ class CanPort(Closing):
 
     @property
     def undelivered(self) -> int:
-        """Number of frames sent on a virtual bus that an endpoint lost because its queue was full."""
+        """Number of frames sent on a virtual bus but lost because a receiving endpoint's queue was full."""
         return self._undelivered
 
     @property
@@ -227,16 +227,16 @@ class CanPort(Closing):
     def dropped(self) -> int:
         """Number of frames dropped because the kernel's receive buffer was full.
 
-        On udp_multicast, the kernel also counts frames of this endpoint and malformed packets. On interfaces
-        other than socketcan and udp_multicast, the number is 0.
+        On udp_multicast, the kernel also counts this endpoint's own frames and malformed packets. On
+        interfaces other than socketcan and udp_multicast, the number is 0.
         """
         return self._dropped_before + (0 if self._socket is None else self._socket.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
 
-        More than 8 bytes are sent in a CAN FD frame with bit rate switching, padded with zeros to a valid
-        length. On a virtual bus, an endpoint whose receive queue is full loses the frame.
+        Payloads longer than 8 bytes are sent in a CAN FD frame with bit rate switching, padded with zeros to
+        a valid length. On a virtual bus, an endpoint whose receive queue is full loses the frame.
 
         Args:
             can_id: Identifier, 0 to 0x7FF.
@@ -295,7 +295,7 @@ class CanPort(Closing):
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames. Interfaces other than socketcan, udp_multicast and timed return
                 one at a time.
 
@@ -354,7 +354,8 @@ class CanPort(Closing):
         requires the capability CAP_NET_ADMIN.
 
         Raises:
-            BusError: if the interface rejects the bit rate. It is then open at the previous bit rate.
+            BusError: if the interface rejects the bit rate. The interface is then open at the previous bit
+                rate.
         """
         before = self.config
         self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})

@@ -21,7 +21,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Default capacity of a queue, frames. It holds 2 s of traffic from a fully loaded 1 Mbit/s bus (8,000
+"""Default capacity of a queue, in frames. It holds 2 s of traffic from a fully loaded 1 Mbit/s bus (8,000
 frames/s)."""
 
 _POLL_S: Final = 0.02
@@ -37,12 +37,12 @@ LONG_NS: Final = 5_000_000
 by up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which the preceding frames are fetched, ns, so that the predicted frame
+"""Time (ns) before a predicted arrival at which the preceding frames are fetched, so that the predicted frame
 itself is fetched without delay."""
 _SHORT_NS: Final = 300_000
 """Minimum pause (ns) between batches of frames; used around a predicted arrival."""
 _LATE_NS: Final = 600_000
-"""Time (ns) after a predicted arrival for which the minimum pause is used."""
+"""Time (ns) after a predicted arrival during which the minimum pause is used."""
 _GIVEN_UP_NS: Final = 200_000_000
 """Time (ns) after its predicted arrival at which a frame is considered lost."""
 _ANSWER_NS: Final = 20_000_000
@@ -73,7 +73,7 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time (ns) until which all received frames have been queued or dropped."""
+        """Monotonic time (ns) up to which all received frames have been queued or dropped."""
         self.due_ns = 0
         """Monotonic time (ns) of the next :meth:`fetch`."""
         self._capacity = capacity
@@ -104,7 +104,7 @@ class Intake:
 
         Raises:
             BusError: if the bus has failed and the queue is empty.
-            Exception: any other exception of the port, if the queue is empty.
+            Exception: any other exception raised by the port, if the queue is empty.
         """
         # Read the error first, so that no frame received before the error is missed.
         error, batches = self._error, self._queue
@@ -123,7 +123,8 @@ class Intake:
 
         Args:
             what: Name of the group. A new prediction replaces the previous one.
-            times_ns: Possible arrival times on the monotonic clock, ns, ascending; empty if unknown.
+            times_ns: Possible arrival times on the monotonic clock, in ns and in ascending order; empty if
+                unknown.
         """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
@@ -145,7 +146,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return when to fetch the next predicted frame (ns), and whether all arrivals are predicted."""
+        """Return the next predicted frame's fetch time (ns), and whether all arrivals are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -169,7 +170,7 @@ class Intake:
         """Move all received frames from the port to the queue.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
 
         Returns:
             Whether there are new frames or an error for :meth:`take`.
@@ -197,7 +198,7 @@ class Intake:
 
 @dataclass(slots=True)
 class _Shared:
-    """State of the receiving thread that several ports share."""
+    """State of the receiving thread shared by several ports."""
 
     intakes: dict[Intake, None]
     """Intakes as keys, in the order in which they were added."""
@@ -209,7 +210,7 @@ class Receiver(Closing):
 
     All ports that can be polled (socketcan and udp_multicast) share one receiving thread. Ports that announce
     their frames (timed) are read in :meth:`wait`, without a thread. Each other port has its own thread,
-    because receiving with python-can may block. If a port fails, reception from the other ports continues.
+    because receiving with python-can can block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill, one per port.
@@ -257,10 +258,10 @@ class Receiver(Closing):
             intake.resume()
             self._signalled[intake] = None
             signalling.call_on_arrival(functools.partial(self._on_signal, intake))
-            self._on_signal(intake)  # frames may have arrived before
+            self._on_signal(intake)  # frames may already have arrived
             return
         if intake in self._alone:
-            # The error makes the old thread end, so it must not be cleared earlier.
+            # The error causes the old thread to end, so it must not be cleared earlier.
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
@@ -281,9 +282,9 @@ class Receiver(Closing):
         self._notify()
 
     def _fetch_signalled(self) -> None:
-        """Fetch the announced frames. Every :data:`_POLL_S`, fetch from all ports.
+        """Fetch the announced frames. Fetch from all ports every :data:`_POLL_S`.
 
-        This detects a failed port, and updates :attr:`Intake.seen_ns` of a port without frames.
+        This detects failed ports, and updates :attr:`Intake.seen_ns` for ports without frames.
         """
         now_ns = clock.monotonic_ns()
         intakes = _drained(self._announced)

@@ -1,4 +1,4 @@
-"""Reception of many socket messages with one call of recvmmsg(2), which Python's socket module lacks.
+"""Receives many socket messages with one call to recvmmsg(2), which Python's socket module lacks.
 
 The call does not wait and takes about 1 µs per message, so it keeps the global interpreter lock (GIL).
 Releasing the GIL for each message would delay other threads longer than that.
@@ -52,8 +52,8 @@ class MessageBatch:
 
     Args:
         count: Maximum number of messages.
-        size: Maximum length of a message, bytes.
-        control: Maximum length of the ancillary data of a message, bytes.
+        size: Maximum length of a message, in bytes.
+        control: Maximum length of the ancillary data of a message, in bytes.
     """
 
     def __init__(self, count: int, size: int, control: int) -> None:
@@ -71,14 +71,14 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Replace the messages in the buffers by up to ``most`` new messages, without waiting.
+        """Replace the messages in the buffers with up to ``most`` new messages, without waiting.
 
         Returns:
             Number of messages received.
 
         Raises:
-            OSError: if receiving fails. If some messages were received before the error, only the next call
-                raises it.
+            OSError: if receiving fails. If some messages were received before the error, it is not raised
+                until the next call.
         """
         used = self._got * _USED.size
         # Restore the buffer lengths, which the kernel has overwritten with the lengths of the messages.
@@ -94,7 +94,7 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield, for each message, the length of its ancillary data and the length of its data, bytes."""
+        """Yield the length of each message's ancillary data and the length of its data, in bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Final
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Receive buffer size requested for a socket, bytes. A frame occupies about 800 bytes of the buffer."""
+"""Receive buffer size requested for a socket, in bytes. A frame occupies about 800 bytes of the buffer."""
 
 SO_RXQ_OVFL: Final = 40
 """Option from <asm-generic/socket.h> that adds the kernel's drop counter to a message's ancillary data.
@@ -19,7 +19,7 @@ _SO_RCVBUFFORCE: Final = 33  # from <asm-generic/socket.h>
 
 
 def enlarge_receive_buffer(sock: socket.socket) -> None:
-    """Set a socket's receive buffer size to :data:`RECEIVE_BUFFER_BYTES`, or to the permitted maximum."""
+    """Set a socket's receive buffer size to :data:`RECEIVE_BUFFER_BYTES`, or to the maximum permitted."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
     except OSError:  # only root may exceed net.core.rmem_max

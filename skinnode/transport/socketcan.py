@@ -1,4 +1,4 @@
-"""Batched reception from a raw SocketCAN socket, with kernel timestamps and the kernel's drop counter.
+"""Receives frames in batches from a raw SocketCAN socket, with kernel timestamps and drop counter.
 
 python-can opens the socket and sends frames. It is not used to receive frames, because it makes two system
 calls per frame and ignores the drop counter. Structures and constants are from <linux/can.h>,
@@ -29,13 +29,13 @@ _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1
 
 HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; then 8 or 64 data bytes
 FD_MTU: Final = 72
-"""Size of struct canfd_frame, bytes. Struct can_frame is shorter."""
+"""Size of struct canfd_frame, in bytes. Struct can_frame is shorter."""
 _STAMPS: Final = struct.Struct("@qqqqqq")  # three timestamps in s and ns: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
-_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # length of ancillary data with timestamps only
+_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # length of ancillary data, timestamps only
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
 """Usual layout of a received frame in memory: identifier, length, 8 data bytes, software and hardware
 timestamps."""
@@ -43,7 +43,7 @@ timestamps."""
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible time (ns) by which a timestamp is later than the reading of its frame."""
+"""Maximum plausible lead (ns) of a frame's timestamp over the time at which the frame is read."""
 
 _IP_S: Final = 5.0
 """Maximum duration (s) of an ``ip link`` command."""
@@ -84,7 +84,7 @@ class SocketReader:
         """Return the frames that have arrived; if there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum time to wait for a frame, s.
+            timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames, up to :data:`BATCH_FRAMES`.
 
         Raises:
@@ -146,7 +146,7 @@ class SocketReader:
 
 
 def set_link_bitrate(config: BusConfig) -> None:
-    """Set the bit rates of a CAN interface with ``ip link``. The interface is down in the meantime.
+    """Set the bit rates of a CAN interface with ``ip link``. The interface is down during the change.
 
     Raises:
         BusError: if ``ip link`` fails. The message contains its error output.

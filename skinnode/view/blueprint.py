@@ -1,4 +1,4 @@
-"""Layout of the viewer's window: the hand in 3-D with texts beside it and curves below it."""
+"""Layout of the viewer's window: the hand in 3-D, with text beside it and curves below it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORCE, DEPTH, LOAD = "curves/force", "curves/depth", "curves/load"
 CONTACTS, HEALTH, EVENTS = "contacts", "health", "events"
 _BACKGROUND: Final = (229, 232, 237)
 _CURVES_S: Final = 20
-"""Time span shown by the curves, s."""
+"""Time span shown by the curves, in s."""
 _DISTANCE: Final = 0.75
 """Distance of the camera from the hand's centre, as a multiple of the hand's diagonal."""
 
@@ -28,7 +28,7 @@ def blueprint(corners_m: Float, *, live: bool) -> rrb.Blueprint:
     """Return the window layout.
 
     Args:
-        corners_m: (P, 3) points of the hand in its frame, m; the camera looks at their centre.
+        corners_m: (P, 3) points of the hand in its frame, in m; the camera looks at their centre.
         live: Whether the window follows the newest data.
     """
     low, high = corners_m.min(axis=0), corners_m.max(axis=0)

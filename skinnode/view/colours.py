@@ -23,9 +23,9 @@ def depth_rgba(depth_m: Float, unknown: NDArray[np.bool_], full_m: float) -> NDA
     """Return the (U N, 4) RGBA colours, 0 to 255, of a surface's points in row-major order.
 
     Args:
-        depth_m: (U, N) depths, m.
+        depth_m: (U, N) depths, in m.
         unknown: (U, N) mask of unknown depths.
-        full_m: Depth shown in the brightest colour, m.
+        full_m: Depth shown in the brightest colour, in m.
     """
     known_m = np.where(unknown, 0.0, depth_m).ravel()
     shades = np.rint(np.clip(known_m * ((_SHADES - 1) / full_m), 0.0, _SHADES - 1)).astype(np.intp)
@@ -35,7 +35,7 @@ def depth_rgba(depth_m: Float, unknown: NDArray[np.bool_], full_m: float) -> NDA
 
 
 def grey_rgba(points: int) -> NDArray[np.uint8]:
-    """Return the (``points``, 4) colours of a surface without a known and current displacement."""
+    """Return the (``points``, 4) colours of a surface whose displacement is unknown or out of date."""
     made = np.full((points, 4), 255, np.uint8)
     made[:, :3] = UNKNOWN_RGB
     return made

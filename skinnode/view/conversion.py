@@ -23,14 +23,14 @@ from skinnode.view.texts import DrawnCounts
 from skinnode.view.tick import Tick
 
 _CHECK_NS: Final = 50_000_000
-"""Interval between health checks in recording time, ns; the same as in a running host."""
+"""Interval between health checks in recording time, in ns; the same as in a running host."""
 _EVENTS: Final = 1024
 
 Draw = Callable[[Tick], None]
 
 
 class Conversion:
-    """Conversion of a recording into a drawing; :meth:`run` carries it out.
+    """Conversion of a recording to a drawing; :meth:`run` performs it.
 
     Args:
         path: Log file of the recording.

@@ -1,4 +1,4 @@
-"""Writes pictures, curves and texts to a Rerun recording stream."""
+"""Writes pictures, curves and text to a Rerun recording stream."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class HandDrawing:
         stream: The recording stream; the caller sets its sinks and closes it.
         hand: The hand.
         exaggeration: Ratio of drawn to measured displacement.
-        wall_minus_mono_ns: Wall-clock time minus tick time, ns.
+        wall_minus_mono_ns: Wall-clock time minus tick time, in ns.
         live: Whether the viewer follows the newest data.
     """
 
@@ -240,9 +240,9 @@ class HandDrawing:
     def _notes(self) -> list[str]:
         shear = SHEAR * self._exaggeration
         notes = [
-            f"Drawn {self._exaggeration:g} times enlarged; shear arrows {shear:g} times. "
-            f"The brightest colour is {1e6 * self._scale.full_m:.0f} µm deep. "
-            f"A force of 1 N is an arrow of {1e3 * FORCE_M_PER_N:g} mm."
+            f"Displacements are magnified {self._exaggeration:g} times, shear arrows {shear:g} times. "
+            f"The brightest colour marks a depth of {1e6 * self._scale.full_m:.0f} µm. "
+            f"A force of 1 N is drawn as an arrow {1e3 * FORCE_M_PER_N:g} mm long."
         ]
         if self.placement.side_by_side:
             notes.append("The hand file gives no separate poses: the patches are drawn side by side.")
@@ -256,7 +256,7 @@ class HandDrawing:
 
 
 def _time_ns(field: FieldFrame, otherwise_ns: int) -> int:
-    """Return the field's SYNC time or, if unknown, the time of its last frame, ns."""
+    """Return the field's SYNC time or, if unknown, the time of its last frame, in ns."""
     if field.stamp is None:
         return otherwise_ns
     return field.stamp.t_sync_ns or field.stamp.t_receive_ns

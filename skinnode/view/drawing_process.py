@@ -22,9 +22,9 @@ from skinnode.view.outputs import Target
 from skinnode.view.tick import Tick
 
 _NICE: Final = 10
-"""Increment of the nice value of the child process."""
+"""Increment added to the child process's nice value."""
 _END_S: Final = 8.0
-"""Time limit for writing the pending data at the end, s."""
+"""Time limit for writing the pending data on closing, in s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class DrawingProcess(Closing):
         self._process.close()
 
     def _complaint(self) -> str:
-        """Return the reason why the child process has ended."""
+        """Return the reason why the child process ended."""
         with suppress(EOFError, OSError):
             if self._connection.poll(1.0):
                 return str(self._connection.recv())

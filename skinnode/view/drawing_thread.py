@@ -21,20 +21,20 @@ from skinnode.view.texts import DrawnCounts
 from skinnode.view.tick import Tick
 
 RATE_HZ: Final = 30.0
-"""Default limit on fields drawn per patch and second; screens show at most 60 frames per second."""
+"""Default limit on fields drawn per patch per second; screens show at most 60 frames per second."""
 STATE_S: Final = 0.25
-"""Interval between updates of the health, contact text and bus load, s."""
+"""Interval between updates of the health, contact text and bus load, in s."""
 _QUEUED: Final = 8
 """Capacity of the queue, in fields per patch."""
 
 
 class DrawingThread(Closing):
-    """Thread that draws a source, from construction until :meth:`close`.
+    """Thread that draws the fields of a source, from construction until :meth:`close`.
 
     Args:
         source: Host or recording; the caller closes it.
         draw: Function that draws the new data; called in this thread.
-        rate_hz: Maximum number of drawn fields per patch and second.
+        rate_hz: Maximum number of fields drawn per patch per second.
     """
 
     def __init__(self, source: Source, draw: Callable[[Tick], None], *, rate_hz: float = RATE_HZ) -> None:

@@ -42,7 +42,7 @@ def normals(surface_m: Float) -> Float:
     grid, one-sided differences at its edge. Where the surface is degenerate, the normal is the z axis.
 
     Args:
-        surface_m: (U, N, 3) points, m.
+        surface_m: (U, N, 3) points, in m.
     """
     if min(surface_m.shape[:2]) < 2:
         return np.broadcast_to(np.array([0.0, 0.0, 1.0]), surface_m.shape).copy()
@@ -65,21 +65,21 @@ def normals(surface_m: Float) -> Float:
 
 
 def displaced_m(rest_m: Float, displacement_m: Float, exaggeration: float) -> Float:
-    """Return the (U, N, 3) surface, m, with exaggerated displacement; unknown displacements count as zero.
+    """Return the (U, N, 3) surface in m with exaggerated displacement; unknown displacements count as zero.
 
     Args:
-        rest_m: (U, N, 3) positions of the electrodes at rest, m.
-        displacement_m: (U, N, 3) displacements, m; NaN where unknown.
+        rest_m: (U, N, 3) positions of the electrodes at rest, in m.
+        displacement_m: (U, N, 3) displacements, in m; NaN where unknown.
         exaggeration: Ratio of drawn to measured displacement.
     """
     return rest_m + exaggeration * np.where(np.isfinite(displacement_m), displacement_m, 0.0)
 
 
 def edge_m(surface_m: Float) -> Float:
-    """Return a surface's edge as a closed (P, 3) line, m, counter-clockwise as seen from outside the skin.
+    """Return a surface's edge as a closed (P, 3) line in m, counter-clockwise as seen from outside the skin.
 
     Args:
-        surface_m: (U, N, 3) points, m.
+        surface_m: (U, N, 3) points, in m.
     """
     sides = (surface_m[0], surface_m[1:, -1], surface_m[-1, -2::-1], surface_m[-2::-1, 0])
     line = np.concatenate(sides)
@@ -87,11 +87,11 @@ def edge_m(surface_m: Float) -> Float:
 
 
 def ring_m(contact: Contact, lift_m: float) -> Float:
-    """Return a closed (:data:`RING_POINTS`, 3) circle, m, with the same area as a contact.
+    """Return a closed (:data:`RING_POINTS`, 3) circle in m with the same area as a contact.
 
     Args:
         contact: Contact in patch coordinates.
-        lift_m: Height of the circle above the undeformed skin, m.
+        lift_m: Height of the circle above the undeformed skin, in m.
     """
     radius_m = math.sqrt(max(contact.area_m2, 0.0) / math.pi)
     angle = np.linspace(0.0, 2.0 * math.pi, RING_POINTS)
@@ -101,7 +101,7 @@ def ring_m(contact: Contact, lift_m: float) -> Float:
 
 
 def force_n(contact: Contact) -> Float:
-    """Return a contact's (3,) force on the skin, N, in patch coordinates.
+    """Return a contact's (3,) force on the skin, in N and in patch coordinates.
 
     Args:
         contact: Contact; a positive normal force points into the skin.

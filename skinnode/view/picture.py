@@ -15,10 +15,10 @@ from skinnode.view.colours import depth_rgba, grey_rgba
 from skinnode.view.geometry import displaced_m, force_n, normals, ring_m
 
 FORCE_M_PER_N: Final = 0.012
-"""Arrow length for a force of 1 N, m."""
+"""Arrow length for a force of 1 N, in m."""
 SHEAR: Final = 4.0
-"""Extra magnification of shear arrows relative to the surface, as on the monitor's maps: shear is about a
-quarter of the depth."""
+"""Extra magnification of shear arrows relative to the surface, as on the monitor's maps, because shear is
+about a quarter of the depth."""
 _SHORT: Final = 0.05
 """Minimum shear drawn as an arrow, as a fraction of the depth shown in the brightest colour."""
 _LIFT: Final = 0.05
@@ -32,9 +32,9 @@ class Style:
     exaggeration: float
     """Ratio of drawn to measured displacement."""
     full_m: float
-    """Depth shown in the brightest colour, m."""
+    """Depth shown in the brightest colour, in m."""
     pitch_m: float
-    """Distance between neighbouring electrodes of the patch, m."""
+    """Distance between neighbouring electrodes of the patch, in m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class PatchPicture:
     force_origins_m: Float
     """(C, 3): start point of each contact's force arrow, which ends at the contact's centre."""
     force_m: Float
-    """(C, 3): arrows of the forces on the skin, :data:`FORCE_M_PER_N` long per newton."""
+    """(C, 3): arrows of the forces on the skin, with a length of :data:`FORCE_M_PER_N` per newton."""
     force_std_m: Float
     """(C, 3): half-axes of each force's 95 % ellipsoid along the contact's axes, on the same scale as the
     arrow."""
@@ -75,7 +75,7 @@ def picture_of(field: FieldFrame, rest_m: Float, style: Style) -> PatchPicture:
 
     Args:
         field: The field.
-        rest_m: (U, N, 3) positions of the electrodes at rest, m.
+        rest_m: (U, N, 3) positions of the electrodes at rest, in m.
         style: Scales of the picture.
     """
     unknown = ~np.isfinite(field.displacement_std_m[..., 2])
@@ -110,7 +110,7 @@ def stale_picture_of(rest_m: Float) -> PatchPicture:
     """Return the picture of a patch without an up-to-date field: its surface at rest, in grey.
 
     Args:
-        rest_m: (U, N, 3) positions of the electrodes at rest, m.
+        rest_m: (U, N, 3) positions of the electrodes at rest, in m.
     """
     none = np.empty((0, 3))
     return PatchPicture(
@@ -137,7 +137,7 @@ def _certain_shear(field: FieldFrame, full_m: float) -> NDArray[np.bool_]:
 
 
 def _centre_m(centroid_m: Float, rest_m: Float, moved_m: Float) -> Float:
-    """Return the drawn (3,) centre of a contact, m, displaced like the nearest electrode."""
+    """Return the drawn (3,) centre of a contact in m, displaced like the nearest electrode."""
     distances = np.linalg.norm(rest_m - centroid_m, axis=-1)
     nearest = np.unravel_index(int(distances.argmin()), distances.shape)
     return np.asarray(centroid_m + moved_m[nearest] - rest_m[nearest])

@@ -21,7 +21,7 @@ ROOT: Final = "skin"
 _GAP: Final = 1.4
 """Centre-to-centre distance of patches drawn side by side, in widths of the largest patch."""
 _SAME_M: Final = 1e-6
-"""Maximum distance at which two patches count as being in the same place, m."""
+"""Maximum distance at which two patches count as being in the same place, in m."""
 
 
 @dataclass(frozen=True, slots=True)

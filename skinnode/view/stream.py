@@ -13,7 +13,7 @@ from skinnode.view.outputs import Target
 _APPLICATION: Final = "skinnode"
 _FLUSH_S: Final = 5.0
 _BATCH_MS: Final = 20
-"""Maximum time for which the SDK holds data back, ms; shorter than the interval between two pictures."""
+"""Maximum time for which the SDK holds data back, in ms; shorter than the interval between two pictures."""
 
 
 @contextmanager
@@ -26,7 +26,7 @@ def open_stream(target: Target) -> Iterator[rr.RecordingStream]:
     batches = rr.ChunkBatcherConfig.LOW_LATENCY()
     batches.flush_tick = _BATCH_MS * 1e-3
     stream = rr.RecordingStream(_APPLICATION, batcher_config=batches)
-    stream.set_log_time_enabled(False)  # all data carry their own times
+    stream.set_log_time_enabled(False)  # all data carry their own timestamps
     stream.set_log_tick_enabled(False)
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if target.url is not None:

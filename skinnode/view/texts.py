@@ -1,4 +1,4 @@
-"""Markdown texts beside the picture: contacts and wrenches with standard deviations, health, bus load."""
+"""Markdown text beside the picture: contacts and wrenches with standard deviations, health, bus load."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def contacts_text(frame: HandFrame) -> str:
     """
     wrenches = [*frame.wrenches.values(), frame.wrench]
     names = [*frame.wrenches, "whole hand"]
-    one = len(frame.wrenches) == 1  # with one link, its wrench differs only in the frame
+    one = len(frame.wrenches) == 1  # the wrench of a single link is the hand's in another coordinate frame
     rows = list(zip(names, wrenches, strict=True))[1 if one else 0 :]
     head = ("contact on", "normal force", "shear force", "position in the hand", "area")
     contacts = _table(head, [_contact_row(contact) for contact in frame.contacts])

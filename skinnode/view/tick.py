@@ -16,7 +16,7 @@ class Tick:
     """Data drawn at one instant."""
 
     t_ns: int
-    """Time on the source's monotonic clock, ns."""
+    """Time on the source's monotonic clock, in ns."""
     fields: Mapping[str, FieldFrame]
     """New fields, by patch name."""
     counts: DrawnCounts

@@ -1,4 +1,4 @@
-"""Runs the ``rerun`` program from the package rerun-sdk as a child process: as a window or as a server.
+"""Runs the ``rerun`` program from the package rerun-sdk as a child process: a window or a server.
 
 The program sends usage statistics unless its configuration file disables them. The child process therefore
 gets a separate configuration folder with a file that disables them. The user's settings are neither read nor
@@ -108,7 +108,7 @@ class ViewerProcess(Closing):
                 time.sleep(0.05)
             else:
                 return
-        raise SkinError(f"the viewer does not listen on port {port} after {_READY_S:.0f} s: {self.why()}")
+        raise SkinError(f"the viewer is not listening on port {port} after {_READY_S:.0f} s: {self.why()}")
 
 
 def require_viewer() -> None:
@@ -137,7 +137,7 @@ def require_free(address: str, port: int) -> None:
 
 
 def free_port() -> int:
-    """Return a port of this machine that is currently free."""
+    """Return a port that is currently free on this machine."""
     with socket.socket() as trial:
         trial.bind((LOCAL, 0))
         port: int = trial.getsockname()[1]

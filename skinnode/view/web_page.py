@@ -31,12 +31,12 @@ _NO_STATISTICS: Final = (
     b"JSON.stringify({analytics_id: 'none', analytics_enabled: false}));</script>"
 )
 _OPTIONS: Final = {"hide_welcome_screen": "1", "persist": "0"}
-"""Query of the page, which disables the welcome screen (which would load examples) and the saved layout of an
-earlier visit."""
+"""Query string of the page; disables the welcome screen, which would load examples, and the layout saved
+during an earlier visit."""
 
 
 class WebPage(Closing):
-    """Web server of the viewer's page, from construction until :meth:`close`.
+    """Web server for the viewer's page, from construction until :meth:`close`.
 
     Args:
         address: Address on which to listen.
@@ -113,7 +113,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header("Content-Length", "0")
                 self.end_headers()
         except (OSError, http.client.HTTPException):
-            self.close_connection = True  # the browser or the SDK's server has gone
+            self.close_connection = True  # the browser or the SDK's server has disconnected
 
     def _host(self) -> str:
         """Return this computer's name from the request's ``Host`` header, without the port."""

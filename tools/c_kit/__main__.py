@@ -87,7 +87,7 @@ def _on_cortex_m0(firmware: Path) -> dict[str, str]:
         cycles, stack = machine.call(f"measure_{step}")
         rows[f"{TITLES[step]}, cycles"] = f"{cycles:,}"
         deepest = max(deepest, stack)
-    assert machine.word("scan", 16) == 1, "the scan did not come through"
+    assert machine.word("scan", 16) == 1, "the scan was not received correctly"
     return {**rows, "stack, bytes": str(deepest)}
 
 

@@ -23,7 +23,7 @@ class CortexM0:
     """Emulated Cortex-M0+ with a program.
 
     Args:
-        elf: program linked to :data:`FLASH` and :data:`RAM`, without initialised data.
+        elf: Program linked to :data:`FLASH` and :data:`RAM`, without initialised data.
     """
 
     def __init__(self, elf: Path) -> None:
@@ -42,7 +42,7 @@ class CortexM0:
         self._branch_from: int | None = None
 
     def call(self, function: str) -> tuple[int, int]:
-        """Call a function without arguments; return its cycles, and its stack use in bytes."""
+        """Call a function without arguments; return its cycle count and its stack use in bytes."""
         self._cycles, self._lowest, self._branch_from = 0, STACK, None
         self._machine.reg_write(arm_const.UC_ARM_REG_SP, STACK)
         self._machine.reg_write(arm_const.UC_ARM_REG_LR, RETURN | 1)
@@ -60,7 +60,7 @@ class CortexM0:
         self._lowest = min(self._lowest, machine.reg_read(arm_const.UC_ARM_REG_SP))
         code = int.from_bytes(machine.mem_read(at, 2), "little")
         if size == 4:
-            self._cycles += 3  # BL; barriers and MRS take equally long
+            self._cycles += 3  # BL; barriers and MRS take the same time
             return
         if code >> 12 == 0b1101:
             self._branch_from = at
@@ -68,7 +68,7 @@ class CortexM0:
 
 
 def cycles_of(code: int) -> int:
-    """Return the cycles of a 16-bit instruction; a conditional branch counts as not taken."""
+    """Return the cycle count of a 16-bit instruction; a conditional branch counts as not taken."""
     top = code >> 11
     if code >> 9 in (0b1011010, 0b1011110):  # PUSH, POP
         registers = (code & 0xFF).bit_count()

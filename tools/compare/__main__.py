@@ -31,7 +31,7 @@ HERE: Final = Path(__file__).parent
 
 
 def tree_of(commit: str | None, folder: Path) -> Path:
-    """Extract ``commit`` to ``folder`` and return the folder; for None, return the working tree."""
+    """Return ``folder`` with ``commit`` extracted to it, or the working tree if ``commit`` is None."""
     if commit is None:
         return ROOT
     folder.mkdir()
@@ -41,7 +41,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script of this folder with the packages in ``tree``."""
+    """Run a script from this folder with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"

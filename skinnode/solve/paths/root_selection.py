@@ -1,4 +1,4 @@
-"""Root selection at the last sample of a path: second attempts, and tests that accept or reject a root.
+"""Root selection at the last sample of a path: second attempts and acceptance tests.
 
 A fold is a surface where det J = 0. The twin of a root is the root on the other side of a nearby fold.
 :mod:`skinnode.solve.roots` defines the thresholds. The functions modify :attr:`PathTracker.end` and the
@@ -24,39 +24,39 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`).
+"""Maximum number of steps in a solve that starts at the smoothest displacement (:func:`guide`).
 
-Starts near a root take 1 to 20 steps. Other starts do not converge.
+Solves that start near a root take 1 to 20 steps. Others do not converge.
 """
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of roots that are only compared with other roots, which differ by much more than the tolerance."""
+"""Accuracy of roots that are only compared with other roots; distinct roots differ by far more than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchEstimate:
-    """Estimate of the whole patch, for checking roots."""
+    """Estimate of the whole patch, used to check roots."""
 
     x: Float
-    """(U, n) positions, pitches."""
+    """(U, n) positions, in pitches."""
     std: Float
-    """(U, n) standard deviations, pitches."""
+    """(U, n) standard deviations, in pitches."""
 
     def agrees(self, x: Float) -> Mask:
-        """Return a mask (U,) of the wires whose positions (U, n), in pitches, the estimate confirms."""
+        """Return a mask (U,) of the wires whose positions (U, n), in pitches, agree with the estimate."""
         return roots.agrees(np.abs(x - self.x), roots.AGREE * self.std)
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return a mask (U,) of the wires with no root, a root too rough for a press, or an undone step."""
+    """Return a mask (U,) of the wires that have no root, a root too rough for a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again, starting at the smoothest displacement that explains it.
 
-    If the new root is across a fold, its twin on the same side as the rest position is used instead. Of a
-    wire's old and new solution, the one with the smoother displacement is kept. If no new root is found, the
-    wire is not CONVERGED, even if it was before.
+    If the new root is across a fold, its twin on the same side as the rest position is used instead. Each
+    wire keeps whichever of its old and new solutions has the smoother displacement. If no new root is found,
+    the wire is not CONVERGED, even if it was previously.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -89,7 +89,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each rough root unless :func:`guide` ends at the same root. The wires are not moved."""
+    """Reject each rough root unless :func:`guide` ends at the same root. The positions do not change."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()
@@ -135,12 +135,12 @@ def keep_likeliest(
 ) -> None:
     """Search for other roots of each wire, and keep the likeliest.
 
-    The search starts at the twins of the present roots, and at ``starts``. A wire stays CONVERGED only if the
+    The search starts at the twins of the current roots and at ``starts``. A wire stays CONVERGED only if the
     energy of every other root is higher by at least ``unlikely``.
 
     Args:
         tracker: Tracker at the end of its path.
-        starts: (S, U, n) starting positions, pitches.
+        starts: (S, U, n) starting positions, in pitches.
         energy: Function that returns the energy of a displacement field (U, n) in pitches: −2 log of its
             probability density, up to a constant.
         unlikely: (U,) minimum energy difference between the likeliest root and any other root.
@@ -204,9 +204,9 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
     """Reject roots that differ from the end of a smooth path, and move these wires back to the path's end.
 
     If the skin itself has crossed a fold, a wrong root on the near side can be smoother and likelier than the
-    correct root. Then :func:`guide` and the posterior find the wrong root, and only the path leads to the
-    correct one. If any root is rejected for this reason, so is every other root that is not at the end of its
-    path.
+    correct root. In that case, :func:`guide` and the posterior find the wrong root, and only the path leads
+    to the correct root. If any root is rejected for this reason, so is every other root that is not at the
+    end of its path.
     """
     if not tracker.second_tries:
         return  # the wires have not left the ends of their paths
@@ -218,7 +218,7 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
 
 
 def _twins(tracker: PathTracker) -> Float:
-    """Return estimated positions (U, n) of the twins of all roots; NaN for wires that are not CONVERGED."""
+    """Return the estimated twins (U, n) of all roots; NaN for wires that are not CONVERGED."""
     x, end, last_a = tracker.solver.x, tracker.end, tracker.last_a
     twins = np.full_like(x, math.nan)
     for u in np.flatnonzero(end.converged).tolist():

@@ -40,7 +40,7 @@ steps if its first contraction ratio is 1/2.
 ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
 """Accuracy of the samples when a path is followed again to check its end.
 
-The maximum number of steps is that of the paper.
+The step limit is taken from the paper.
 """
 
 
@@ -65,13 +65,13 @@ class Uniform:
             the last two solutions, and wires without a plausible root at the last sample are solved again
             from the smoothest displacement. In tests with presses of 50 %, the secant reduced the number of
             unsolved wires from 7 of 197 to 0, and the number of evaluations per sample from 4 to 2.9.
-        intermediate_tolerance: Tolerance at all samples except the last, for r and for x in pitches.
+        intermediate_tolerance: Tolerance on both r and x (in pitches) at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum number of operator steps at each sample except the last.
         final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not a positive integer.
     """
 
     steps: int | None = None
@@ -105,16 +105,16 @@ class Periodic:
     The other samples are skipped, because the last solution satisfies their equations within the tolerance.
     The last sample is always solved.
 
-    If the cycle is not given, it is found by a search. The search follows the path from the rest position
+    If no cycle is given, the schedule searches for it. The search follows the path from the rest position
     with a tolerance of 1e-6, then 1e-5, 1e-4 and 1e-3, and skips samples whose first-order optimality is
-    below the tolerance. T is the median number of samples from one solve to the next, for the wire with the
-    smallest median. The search ends at the first tolerance for which T is at least 2; the path then restarts
-    from rest and is solved with this cycle and tolerance. If no tolerance yields a cycle, every sample is
-    solved with a tolerance of 1e-6.
+    below the tolerance. T is the median number of samples between successive solves of a wire, for the wire
+    with the smallest median. The search ends at the first tolerance for which T is at least 2; the path then
+    restarts from rest and is solved with this cycle and tolerance. If no tolerance yields a cycle, every
+    sample is solved with a tolerance of 1e-6.
 
     The tolerances cannot be compared directly with those of the paper. The paper does not scale its
-    equations, and its ‖Jᵀr‖∞ is larger by a factor of F² than the one used here, with r = a F − 1 and lengths
-    in pitches. The value of F depends on the unit of length, which the paper does not state.
+    equations, and its ‖Jᵀr‖∞ is larger by a factor of F² than the value used here, with r = a F − 1 and
+    lengths in pitches. The value of F depends on the unit of length, which the paper does not state.
 
     Args:
         cycle: Cycle T in samples, if known from an earlier press of the same size and rate; None to search
@@ -126,7 +126,7 @@ class Periodic:
         final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not a positive integer.
     """
 
     cycle: int | None = None
@@ -157,7 +157,7 @@ class Periodic:
         _finish(tracker, self)
 
     def _search(self, tracker: PathTracker) -> tuple[int | None, float]:
-        """Return the cycle and the tolerance for which it was found; without a cycle, None and 1e-6."""
+        """Return the cycle and the tolerance for which it was found; None and 1e-6 if there is no cycle."""
         for tolerance in RELAXED_TOLERANCES:
             tracker.restart()
             accuracy = Accuracy(tolerance, self.intermediate_steps)
@@ -171,10 +171,10 @@ class Periodic:
 
 
 def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
-    """Return the shortest cycle of any wire: its median number of samples from one solve to the next.
+    """Return the shortest cycle of any wire: its median number of samples between successive solves.
 
     Args:
-        solved: (T, U) bool, True if the wire was solved at the sample.
+        solved: (T, U) bool: True where the wire was solved at the sample.
 
     Returns:
         Cycle in samples; None if no wire was solved at least three times.
@@ -187,31 +187,31 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Schedule that adapts the step length of each wire, to solve few points; interpolates R between samples.
+    """Schedule that adapts each wire's step length to solve few points; interpolates R between samples.
 
-    Each step consists of an Euler step along ∂X/∂R, with the factors of the last Jacobian, and of operator
-    steps that correct the position. The step length keeps the distance between the predicted and the
-    corrected point constant, so that Newton's method contracts equally well in every step. The error of an
-    Euler step is proportional to the square of its length (Deuflhard 2004, section 5.1.3). A step that does
-    not reach a root on the branch of the rest position is undone, and the next step is half as long.
+    Each step consists of an Euler step along ∂X/∂R, computed with the factors of the last Jacobian, followed
+    by operator steps that correct the position. The step length keeps the distance between the predicted and
+    the corrected point constant, so that Newton's method contracts equally well in every step. The error of
+    an Euler step is proportional to the square of its length (Deuflhard 2004, section 5.1.3). A step that
+    does not reach a root on the branch of the rest position is undone, and the next step is half as long.
 
     Interpolated resistances do not belong to a deformation of the skin, so the path can reach a fold (det J =
     0) even if the press does not. If a wire cannot pass a fold, or its root is too rough for a press, it is
-    solved again by Levenberg-Marquardt, starting at the smoothest displacement that explains the last sample
-    (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
+    solved again with Levenberg-Marquardt, starting at the smoothest displacement that explains the last
+    sample (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
 
     One sample is enough, because the path starts at rest and ends at the last sample. If there are more
     samples, the wires with doubtful roots are also followed sample by sample, as are the wires that moved far
-    enough to have crossed a fold. Across a fold, the smoother root can be wrong, and only the samples show
-    it.
+    enough to have crossed a fold. Across a fold, the smoother root can be wrong, and only the samples reveal
+    this.
 
     Args:
         points: Maximum number of path points to attempt per wire.
-        final_tolerance: Tolerance at the last sample, for r and for x in pitches.
+        final_tolerance: Tolerance on both r and x (in pitches) at the last sample.
         final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not a positive integer.
     """
 
     points: int = 50
@@ -223,7 +223,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Advance all wires to the last sample and solve it; make further attempts for doubtful wires."""
+        """Advance all wires to the last sample and solve it; then retry doubtful wires."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)

@@ -1,4 +1,4 @@
-"""Contact regions: assign the loaded cells of a patch to contacts.
+"""Contact regions: assignment of a patch's loaded cells to contacts.
 
 The load sum of a cell is the sum of the pressing loads in its 3 × 3 neighbourhood. A peak is a local maximum
 of the load sum. The cells are visited in order of decreasing load sum, and each is added to the area of a
@@ -30,8 +30,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 
 SIGNIFICANT: Final = 5.0
-"""Minimum load of a contact, in standard deviations. Among the 100 load sums of a frame, noise exceeds this
-limit about once in ten thousand frames."""
+"""Minimum load of a contact, in standard deviations. In about one frame in ten thousand, noise alone makes
+one of the 100 load sums exceed this limit."""
 SIGNIFICANT_STILL: Final = 4.0
 """Value of :data:`SIGNIFICANT` for a contact that existed in the last frame."""
 BLOCK_EXTRA: Final = 22.0
@@ -39,12 +39,12 @@ BLOCK_EXTRA: Final = 22.0
 nine degrees of freedom, χ² exceeds 25 + 22 as rarely as a normal variable exceeds five standard
 deviations."""
 PRESSED: Final = 6.0
-"""Minimum indentation of the skin at the strongest peak, in standard deviations, for it to be a contact."""
+"""Minimum skin indentation at the strongest peak for it to count as a contact, in standard deviations."""
 PRESSED_STILL: Final = 5.0
 """Value of :data:`PRESSED` for a contact that existed in the last frame."""
 RELEVANT: Final = 0.2
-"""Minimum load sum of a contact, as a fraction of that of the strongest contact. Errors of the load estimate
-next to a contact reach a tenth of its load sum."""
+"""Minimum load sum of a contact, as a fraction of the strongest contact's load sum. Errors in the load
+estimate next to a contact reach a tenth of the contact's load sum."""
 RELEVANT_STILL: Final = 0.15
 """Value of :data:`RELEVANT` for a contact that existed in the last frame."""
 PART: Final = 0.1
@@ -53,17 +53,17 @@ PART_SIGNIFICANT: Final = 3.0
 """Minimum load sum of a cell in a contact, in standard deviations of the peak's load sum. Without this limit,
 noise shifts the centre of a very light touch by up to a pitch."""
 PART_MOST: Final = 0.6
-"""Load sum, as a fraction of that at the peak, above which a cell is part of the contact even if it does not
-reach :data:`PART_SIGNIFICANT`."""
+"""Load sum, as a fraction of the load sum at the peak, above which a cell is part of the contact even if it
+does not reach :data:`PART_SIGNIFICANT`."""
 GAP: Final = 0.5
-"""Maximum load sum between two contacts, as a fraction of that at the smaller peak. In
+"""Maximum load sum between two contacts, as a fraction of the load sum at the smaller peak. In
 ``tests/solve/test_contact_number.py``, no single body was split with limits from 0.4 to 0.6. With 0.75,
 plates at the edge of the patch were split. With 0.5, two spheres are separated if they are at least 5 pitches
 apart."""
 GAP_ONE: Final = 0.4
-"""Value of :data:`GAP` for two peaks that belonged to one contact in the last frame."""
+"""Value of :data:`GAP` for two peaks that belonged to the same contact in the last frame."""
 GAP_TWO: Final = 0.6
-"""Value of :data:`GAP` for two peaks that belonged to two contacts in the last frame."""
+"""Value of :data:`GAP` for two peaks that belonged to different contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
 """Minimum difference between the load sum at the smaller of two peaks and the load sum between the peaks, in
 standard deviations, for the peaks to be separate contacts."""
@@ -113,7 +113,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
     s: Float,
     b: Float,
 ) -> float:
-    """Return χ² = qᵀ Σ⁻¹ q for the normal loads q of up to nine cells, with their posterior covariance Σ.
+    """Return χ² = qᵀ Σ⁻¹ q for the normal loads q of up to nine cells with posterior covariance Σ.
 
     ``s`` (9, 9) and ``b`` (9,) are work arrays.
     """
@@ -149,7 +149,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write the cells with an electrode, among ``cell`` and its neighbours, into ``out``; return how many."""
+    """Write those of ``cell`` and its neighbours that have an electrode into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:
@@ -174,7 +174,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index,
     signs: Float,
 ) -> bool:
-    """Return whether ``peak`` and the smaller peak ``other`` belong to two contacts.
+    """Return whether ``peak`` and the smaller peak ``other`` belong to different contacts.
 
     ``between`` is a cell between them. ``cells`` (27,) and ``signs`` (18,) are work arrays.
     """
@@ -204,7 +204,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
 
 @njit_part
 def _sort_peaks(press: Float, own: NDArray[np.bool_], near: Index, total: Float, order: Index) -> int:
-    """Write the load sums into ``total``, and the cells by decreasing load sum into ``order``.
+    """Write the load sums into ``total``, and the cells in order of decreasing load sum into ``order``.
 
     Returns the number of cells with an electrode.
     """
@@ -374,11 +374,11 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
         rows: (m, 3Q) rows of L⁻¹ J G before multiplication by ``weight``.
         weight: (m,) factor of each row.
         share: (Q,) prior variances of the loads, relative to ``scale2``.
-        scale2: Squared scale s² of the prior, pitch².
+        scale2: Squared scale s² of the prior, in pitch².
         own: (Q,) bool: True for a cell with an electrode.
         near: (Q, 9) indices of each cell and its neighbours; −1 outside the lattice.
         before: (Q,) contact number of each cell in the last frame.
-        number: (Q,) receives the contact number of each cell; 0 for cells without contact and for the
+        number: (Q,) receives the contact number of each cell; 0 for cells without a contact and for the
             outermost ring.
         outside: (Q,) receives the contact numbers of the outermost ring; 0 for all other cells.
         scratch: Work arrays from :func:`region_scratch`.
@@ -406,7 +406,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
 def _dilate(  # noqa: C901 - neighbours as loops
     total: Float, near: Index, number: Index, outside: Index, added: Index
 ) -> None:
-    """Add the neighbouring cells to each contact, and number the cells of the outermost ring next to it."""
+    """Add the neighbouring cells to each contact, and number the adjacent cells of the outermost ring."""
     cells = number.size
     for cell in range(cells):
         added[cell] = 0

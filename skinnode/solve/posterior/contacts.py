@@ -31,16 +31,16 @@ HERTZ_SPREAD: Final = 2.5
 """Ratio of a² to the pressure-weighted mean of r² in a Hertz contact of radius a, where the pressure is
 proportional to √(1 − r²/a²)."""
 PULLING: Final = 0.25
-"""Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which pulling loads are
-left out. The half-space model needs pulling loads at the rim of a contact to reproduce the displacement of a
-supported layer. In measurements, the ratio was at most 0.15 on bonded layers of up to 8 mm, and at least 0.33
-on a half-space."""
+"""Minimum ratio of the sum of all loads of a contact to the sum of its pressing loads; below this ratio,
+pulling loads are left out. The half-space model needs pulling loads at the rim of a contact to reproduce the
+displacement of a supported layer. In measurements, the ratio was at most 0.15 on bonded layers of up to 8 mm,
+and at least 0.33 on a half-space."""
 PULLED_OFF: Final = 0.1
 """Standard deviation of a contact's centre along the surface if pulling loads are left out, in cell widths.
 The measured RMS error on layers of 2 to 8 mm was at most 0.11 cell widths."""
 BEYOND: Final = 1.0
 """Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
-represents all loads beyond the patch. With a value of 0.5, errors of the force under plates larger than the
+represents all loads beyond the patch. With a value of 0.5, errors in the force under plates larger than the
 patch would reach 4.8 standard deviations."""
 
 
@@ -57,7 +57,7 @@ class LoadEstimate:
     share: Float
     """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float
-    """Squared scale s² of the prior, pitch²."""
+    """Squared scale s² of the prior, in pitch²."""
     doubt: float = PRIOR_DOUBT
     """Factor applied to the variances, because the loads depend mainly on the prior."""
 
@@ -75,9 +75,9 @@ class ContactFinder:
         calibrated: Whether forces are calibrated. If not, the standard deviation of a normal force covers the
             range from a half-space to a layer that is as thick as the clearance and bonded to a rigid
             support.
-        thickness: Tolerance of the thickness, as a fraction of the clearance.
+        thickness: Thickness tolerance, as a fraction of the clearance.
         outermost: Whether a contact includes the loads of adjacent cells in the outermost ring. Set this to
-            False if the prior expects equal loads everywhere, because the loads of the ring are then
+            False if the prior expects equal loads everywhere, because the loads in the ring are then
             overestimated.
     """
 
@@ -109,7 +109,7 @@ class ContactFinder:
         self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
         self._depth_m, self._depth = np.zeros((2, cells))
         self._press = np.zeros(cells)
-        self._field = np.zeros((2, len(self._own), 3))  # displacement and its standard deviations, m
+        self._field = np.zeros((2, len(self._own), 3))  # displacement and its standard deviations, in m
         self._scratch = region_scratch(cells)
         self._work = np.empty(cells, np.int64), np.empty(cells), np.empty((cells, 5))
 
@@ -124,11 +124,11 @@ class ContactFinder:
 
         Args:
             loads: Loads estimated from the frame.
-            displacement_m: (U, N, 3) displacement, m.
-            std_m: (U, N, 3) standard deviation of the displacement, m; inf for unsolved electrodes.
+            displacement_m: (U, N, 3) displacement, in m.
+            std_m: (U, N, 3) standard deviation of the displacement, in m; inf for unsolved electrodes.
 
         Returns:
-            (U, N, 3) forces on the electrodes' cells, N, and the contacts in order of decreasing normal
+            (U, N, 3) forces on the electrodes' cells, in N, and the contacts in order of decreasing normal
                 force.
         """
         np.copyto(self._field[0], displacement_m.reshape(-1, 3))
@@ -202,7 +202,7 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
 ) -> None:
     """Write pressing loads (Q,), depths (Q,) in m and in standard deviations, and forces (UN, 3) in N.
 
-    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. A depth with an infinite
+    ``field`` (2, UN, 3) contains the displacement and its standard deviations, in m. A depth with an infinite
     standard deviation is written as 0. Depths of cells without an electrode are not written.
     """
     for cell in range(press.size):
@@ -247,8 +247,8 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     ``std``. The variances are multiplied by ``doubt``, because the distribution of the load over the
     cells depends mainly on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work arrays.
 
-    Returns the cell closest to the centre, True if pulling loads were left out, and the sum of the pressing
-    loads in N.
+    Returns the cell closest to the centre, a bool that is True if pulling loads were left out, and the sum of
+    the pressing loads in N.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):

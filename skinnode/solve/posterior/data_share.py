@@ -16,8 +16,8 @@ def data_share(std: Float, core: Float, prior: LoadPrior) -> Float:
     depends on the prior therefore follows from ``std``² − ``core``².
 
     Args:
-        std: (U, f) standard deviations, pitches.
-        core: (U, f) standard deviations for the 95 % interval, pitches.
+        std: (U, f) standard deviations, in pitches.
+        core: (U, f) standard deviations for the 95 % interval, in pitches.
         prior: Prior of the displacement.
 
     Returns:

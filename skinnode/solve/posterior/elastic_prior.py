@@ -1,7 +1,7 @@
-"""Elastic prior: the displacement of the rubber expected before any resistance is measured.
+"""Elastic prior: the rubber displacement expected before any resistance is measured.
 
 Each electrode is at the centre of a cell one pitch wide. Independent loads on the surfaces of the cells
-displace the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
+displace the electrodes according to the response G of an elastic half-space (Boussinesq, Cerruti;
 :func:`skinnode.model.elastic.rectangle_compliance`). The prior of the displacement u is
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
@@ -28,9 +28,9 @@ from skinnode.solve.linalg.cholesky import multiply
 from skinnode.solve.posterior.load_cells import MARGIN, LoadCells
 
 SHEAR_SHARE: Final = 0.4
-"""Ratio of expected shear loads to expected normal loads (standard deviations). The marginal likelihood of
-the data hardly changes between 0.25 and 0.4. With smaller values, the standard deviations are too small on
-layouts that are insensitive to shear (`aligned`)."""
+"""Ratio of the standard deviation of shear loads to that of normal loads. The marginal likelihood of the data
+hardly changes between 0.25 and 0.4. With smaller values, the standard deviations are too small on layouts
+that are insensitive to shear (`aligned`)."""
 LAYER_SHARE: Final = 0.25
 """Size of the displacements that the data check expects on a bonded layer, relative to those on a half-space.
 With 0.1, a dent in a thin layer is mistaken for a faulty wire. With 0.5, delayed readings of an upper wire
@@ -48,19 +48,19 @@ class ElasticPrior:
     """
 
     covariance: Float
-    """(3UN, 3UN) covariance C of the displacement, pitch²."""
+    """(3UN, 3UN) covariance C of the displacement, in pitch²."""
     response: Float
-    """(3UN, 3Q) displacement per unit load, pitches. At s = 1, each load has a standard deviation of 1."""
+    """(3UN, 3Q) displacement per unit load, in pitches. At s = 1, each load has a standard deviation of 1."""
     load_n: Float
-    """(3,) force of a unit load along the wire, across the wire and along the normal, N."""
+    """(3,) force of a unit load along the wire, across the wire and along the normal, in N."""
     cell_m: Float
-    """(Q, 3) centres of the cells, m."""
+    """(Q, 3) centres of the cells, in m."""
     frame: Float
     """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     cell_area_m2: float
-    """Area of a cell, m²."""
+    """Area of a cell, in m²."""
     shape: tuple[int, int]
-    """Number of cells across and along the wires; their product is Q."""
+    """Numbers of cells across and along the wires; their product is Q."""
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:

@@ -5,7 +5,7 @@ Each frame passes through these steps:
 - Gate: select the wires whose resistances differ from those at rest by more than the noise. Only the
   equations of these wires are used.
 - Hold: if the last field explains the whole frame within the noise, keep it.
-- Track: solve from the last field by chord or Gauss-Newton steps. If this fails, anneal from rest
+- Track: starting from the last field, solve by chord or Gauss-Newton steps. If this fails, anneal from rest
   (``map_estimate``).
 - Adapt: estimate the prior scale, the expected load locations and, if requested, the noise.
 - Reject: if no deformation explains the residual of a wire, mark the wire as INCONSISTENT and solve again
@@ -62,23 +62,23 @@ _WARM: Final[weakref.WeakKeyDictionary[PatchLayout, set[tuple[object, ...]]]] = 
 
 
 class FrameEstimator:
-    """Estimator of the displacement, loads and contacts of one patch, frame by frame.
+    """Estimates the displacement, loads and contacts of one patch, frame by frame.
 
     This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each
     stream needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.
-        options: Options of the estimate; :class:`skinnode.solve.options.PosteriorOptions()` by default.
+        options: Estimation options; :class:`skinnode.solve.options.PosteriorOptions()` by default.
         **arguments: Options by name; these take precedence over ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 before :meth:`warm_up` or if no
+        from_rest_s: Minimum time to solve a touched frame from rest, in s; 0 before :meth:`warm_up` or if no
             deadline is set.
-        noise_estimate: Estimate of the stream's noise, by which the stated noise is scaled; None if the
-            stated noise is used as it is.
+        noise_estimate: Estimate of the stream's noise, used to scale the stated noise; None if the stated
+            noise is used unchanged.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -177,7 +177,7 @@ class FrameEstimator:
             self._contacts.reset()
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
-        self._compared = np.zeros_like(self._trusted)  # last field compared with an annealed one
+        self._compared = np.zeros_like(self._trusted)  # last field that was compared with an annealed field
         self._annealed = False  # whether the current field was annealed from rest
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
@@ -185,11 +185,11 @@ class FrameEstimator:
         self._seen = np.zeros(self.layout.shape, bool)  # resistances used for the trusted field
 
     def estimate(self, frame_ohm: ArrayLike, valid: ArrayLike, relative_noise: ArrayLike) -> FieldFrame:
-        """Estimate the field of one frame like :meth:`skinnode.Posterior.update`, without the data check.
+        """Estimate the field of one frame like :meth:`skinnode.Posterior.update`, but without the data check.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm. Values that are not positive and finite are ignored.
-            valid: (U, K) bool, False where a reading is missing.
+            frame_ohm: (U, K) resistances, in ohms. Values that are not positive and finite are ignored.
+            valid: (U, K) bool: False where a reading is missing.
             relative_noise: Relative noise of this frame, a number or (U, K).
 
         Returns:
@@ -226,7 +226,8 @@ class FrameEstimator:
         """Set the deadline of subsequent updates.
 
         Args:
-            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; inf for none.
+            until: Deadline on the clock :func:`skinnode.process.clock.perf_counter`, in s; inf for no
+                deadline.
         """
         self._until = until
 
@@ -237,7 +238,7 @@ class FrameEstimator:
         this covariance does not.
 
         Returns:
-            (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
+            (3UN, 3UN) covariance, in m²; 0 for coordinates that are not free.
 
         Raises:
             RuntimeError: If the last frame was not solved.
@@ -256,7 +257,7 @@ class FrameEstimator:
         The result is −2 log of the prior density, up to a constant.
 
         Args:
-            moved: (U, 3N) displacement u, pitches.
+            moved: (U, 3N) displacement u, in pitches.
         """
         return self._estimator.roughness(moved) / self._estimator.load_prior.scale2
 
@@ -289,13 +290,13 @@ class FrameEstimator:
     def see_noise(self, ohm: Float, noise: Float, rounding_ohm: Float | None, valid: Mask | None) -> None:
         """Pass a frame to the noise estimate; the arguments are those of :meth:`NoiseEstimate.see`."""
         if self.noise_estimate is not None and self.noise_estimate.see(ohm, noise, rounding_ohm, valid):
-            self._seen = np.zeros_like(self._seen)  # the trusted field was solved with a different noise
+            self._seen = np.zeros_like(self._seen)  # the trusted field assumed a different noise
 
     def _observe(self, readings: Readings) -> Observation:
         return self._model.observe(readings, self._hyper.noise_factor)
 
     def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        # one geometry error in a hundred can exceed the lower limit by chance, so only the others are tested
+        # the lower limit is not applied to geometry errors, because one in a hundred exceeds it by chance
         count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
         return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
@@ -428,8 +429,8 @@ class FrameEstimator:
         """Adapt the hyperparameters; on a layout with folds, also choose between two maxima.
 
         Annealing with a prior that expects loads everywhere can lead to a wrong maximum. On layouts with
-        folds, an annealed frame is therefore annealed again, with the loads expected where they were found.
-        The second field is kept if its −2 log posterior is lower by more than
+        folds, an annealed frame is therefore annealed again, with loads expected where they were found. The
+        second field is kept if its −2 log posterior is lower by more than
         :data:`skinnode.solve.roots.LIKELIER`.
         """
 

@@ -1,4 +1,4 @@
-"""Gating: χ² tests for the wires that moved, and for those whose resistances no deformation explains.
+"""Gating: χ² tests that find wires that moved, and wires whose resistances no deformation explains.
 
 Each wire is tested in two ways: with the χ² of its residuals, and with the apparent movement of each
 coordinate. χ² alone can miss a movement of one electrode by 7 standard deviations.
@@ -16,10 +16,10 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 
 QUIET_CHANCE: Final = 0.005
-"""Probability per frame that the χ² test takes an unmoved wire for a moved one."""
+"""Probability per frame that the χ² test mistakes an unmoved wire for a moved wire."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Maximum apparent movement of a coordinate of an unmoved wire, in standard deviations. With 300 coordinates
-at rest, noise exceeds this limit in one frame in 15."""
+"""Maximum apparent movement of any coordinate of an unmoved wire, in standard deviations. With 300
+coordinates at rest, noise exceeds this limit in one frame in 15."""
 KEPT: Final = 50
 """Number of frames for which a wire stays in the estimate after an unexpected movement."""
 
@@ -30,13 +30,13 @@ class Fit(NamedTuple):
     chi_squared: Float
     """(U,) χ² of each wire."""
     sharpest: Float
-    """(U,) largest apparent error of any one coordinate of each wire, in standard deviations."""
+    """(U,) largest apparent error in any coordinate of each wire, in standard deviations."""
     move: Float
-    """(U, f) best-fitting movement of each coordinate while all others are fixed, pitches."""
+    """(U, f) best-fitting movement of each coordinate with all others fixed, in pitches."""
 
 
 class Gate:
-    """χ² tests of the wires of one patch, with a memory of the wires that moved recently.
+    """χ² tests for the wires of one patch; remembers which wires moved recently.
 
     Args:
         wires: Number of upper wires.
@@ -91,7 +91,7 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return the χ² of each wire (U,) relative to the limit above which the wire is INCONSISTENT."""
+        """Return each wire's χ² (U,), relative to the limit above which the wire is INCONSISTENT."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 

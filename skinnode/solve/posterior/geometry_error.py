@@ -1,4 +1,4 @@
-"""Geometry errors: the manufacturing errors of a patch, estimated as nuisances.
+"""Geometry errors: the manufacturing errors of a patch, estimated as nuisance parameters.
 
 The resistances at rest (R₀) are measured, so a geometry error θ has no effect on the residuals at rest. Away
 from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest. The effect grows with
@@ -45,9 +45,9 @@ LOWER: Final = 3
 EFFECTS: Final = COMMON + UPPER + LOWER
 """Number of geometry nuisances that affect each residual."""
 GAIN_SHARE: Final = math.sqrt(0.5)
-"""Standard deviation of each of the two parts of a gain error, in tolerances. The first part is common to all
-wires and models a shared converter. The second part is independent for each upper wire and models a converter
-per wire."""
+"""Standard deviation of each of the two parts of a gain error, in units of the tolerance. The first part is
+common to all wires and models a shared converter. The second part is independent for each upper wire and
+models one converter per wire."""
 
 
 def nuisances(wires: int, equations: int) -> int:
@@ -56,12 +56,12 @@ def nuisances(wires: int, equations: int) -> int:
 
 
 class GeometryError:
-    """Residuals of a patch with the geometry errors g, and their derivatives with respect to g.
+    """Residuals of a patch with geometry errors g, and their derivatives with respect to g.
 
     Args:
         problem: The patch.
         elastic: Elastic prior of the patch, which provides the surface normals.
-        tolerances: Manufacturing tolerances of the patch; the standard deviations of the errors.
+        tolerances: Manufacturing tolerances of the patch, used as the standard deviations of the errors.
     """
 
     def __init__(self, problem: PatchProblem, elastic: ElasticPrior, tolerances: Tolerances) -> None:
@@ -89,7 +89,7 @@ class GeometryError:
 
         Args:
             members: (P,) numbers of the wires.
-            moved: (U, 3N) displacement, pitches.
+            moved: (U, 3N) displacement, in pitches.
             a: (U, K) resistances times gain, R · gain.
             weight: (U, K) weights 1/σ of the resistances.
             g: Geometry nuisances; their number is given by :func:`nuisances`.
@@ -121,7 +121,7 @@ class GeometryError:
         )  # fmt: skip
 
     def _shifts(self, g: Float) -> tuple[Float, Float]:
-        """Return the upper electrodes' shifts (U, 3N) and the shifted lower electrodes (3, M, K), pitches."""
+        """Return the upper electrodes' shifts (U, 3N) and shifted lower electrodes (3, M, K), in pitches."""
         wires, coordinates = self._problem.rest.shape
         upper = g[COMMON : COMMON + UPPER * wires].reshape(wires, UPPER)[:, :3]
         lower = g[COMMON + UPPER * wires :].reshape(-1, LOWER)

@@ -29,15 +29,15 @@ SCALE_MOST: Final = 1.0
 """Maximum prior scale s, in clearances. With a larger scale, the prior would allow the surface to be below
 the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Minimum change in ln s for the scale to be updated. The standard deviations change by a smaller factor than
-the scale."""
+"""Minimum change in ln s that triggers an update of the scale. The standard deviations change by a smaller
+factor than the scale."""
 SCALE_LEAST: Final = 1.0
 """Minimum prior scale, relative to the scale at which the expected changes in the resistances equal their
 noise. Displacements below the noise cannot be detected, so the standard deviations must account for them."""
 ADAPTIONS: Final = 5
-"""Maximum number of updates of the hyperparameters per frame."""
+"""Maximum number of hyperparameter updates per frame."""
 DISC_FITS: Final = 2
-"""Maximum number of fits of the discs per frame."""
+"""Maximum number of disc fits per frame."""
 REFIT: Final = 0.1
 """Change in any coordinate since the last fit of the discs, relative to the largest displacement, above
 which the discs are refitted."""
@@ -45,8 +45,8 @@ UNTOUCHED: Final = 0.1
 """Load variance expected on untouched skin, relative to the minimum prior variance of equal loads over the
 whole patch (:data:`SCALE_LEAST`)."""
 FAR_LOADS: Final = 0.05
-"""Standard deviation of the loads on untouched skin, relative to those of the strongest disc. Far from a
-contact, the skin does not move exactly like a half-space. With 0, the 95 % intervals contained 90 % of the
+"""Standard deviation of the loads on untouched skin, relative to that of the strongest disc's loads. Far from
+a contact, the skin does not move exactly like a half-space. With 0, the 95 % intervals contained 90 % of the
 errors under ridges on a bonded layer; with 0.03, they contained 97 %."""
 NOISY: Final = 2.0
 """Noise allowance added to the limit :data:`REFIT`, in standard deviations of the least certain
@@ -57,7 +57,7 @@ solves."""
 NOISE_WORTH: Final = 20.0
 """Weight of the configured noise in the noise estimate, as an equivalent number of resistances."""
 NOISE_STEP: Final = math.log(1.1)
-"""Minimum change in the logarithm of the estimated noise for the estimate to be updated."""
+"""Minimum change in the logarithm of the estimated noise that triggers an update of the estimate."""
 
 Observe = Callable[[float], Observation]
 """Function that returns the observation of a frame for a given noise factor."""
@@ -68,10 +68,10 @@ class Hyperparameters:
 
     Args:
         estimator: MAP estimator of the patch.
-        clearance: Median clearance, pitches.
-        scale2: Fixed s², pitch²; None to estimate it.
+        clearance: Median clearance, in pitches.
+        scale2: Fixed s², in pitch²; None to estimate it.
         estimate_noise: Whether to estimate the noise.
-        discs: Discs of expected loads; None to expect loads in the cells where they were found.
+        discs: Discs in which loads are expected; None to expect loads in the cells where they were found.
 
     Attributes:
         noise_factor: Ratio of the estimated to the configured noise.
@@ -89,7 +89,7 @@ class Hyperparameters:
         self._estimator, self._prior = estimator, estimator.load_prior
         self.loads = LoadPosterior(estimator)
         self.discs = discs
-        self._rough = False  # whether the discs were fitted only to a field of the uniform prior
+        self._rough = False  # whether the discs were fitted only to a field estimated with the uniform prior
         self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
         self._fixed = scale2
         self._estimate_noise = estimate_noise
@@ -111,9 +111,9 @@ class Hyperparameters:
             self.discs.reset()
 
     def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
-        """Return both standard deviations (U, f) in pitches, including the uncertainty of the discs.
+        """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
 
-        The first result also accounts for a further touch that is too light to be detected.
+        ``std`` also accounts for an additional touch that is too light to be detected.
         """
         if self.discs is None:
             return std, core
@@ -204,7 +204,7 @@ class Hyperparameters:
         """Fit the discs to the frame, unless they already fit; return whether the prior changed.
 
         The first discs of a touch are fitted to data linearised at a field that the uniform prior has
-        blurred. They are therefore refitted to data linearised at the field that they lead to.
+        blurred. They are therefore refitted to data linearised at the resulting field.
         """
         discs, prior, estimator = self.discs, self._prior, self._estimator
         assert discs is not None

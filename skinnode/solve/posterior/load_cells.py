@@ -24,19 +24,19 @@ class LoadCells:
     """Cells of one layout, with E = U N electrodes and Q cells."""
 
     centre_m: Float
-    """(Q, 3) centres of the cells, m."""
+    """(Q, 3) centres of the cells, in m."""
     frame: Float
     """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     electrode_frame: Float
     """(E, 3, 3) unit vectors at the electrodes, in the order of ``frame``."""
     offset_m: Float
-    """(E, Q, 2) offset of each electrode from each cell, along the tangents of the cell, m."""
+    """(E, Q, 2) offset of each electrode from each cell, along the tangents of the cell, in m."""
     height_m: float
-    """Median height of the electrodes above the lower layer, m."""
+    """Median height of the electrodes above the lower layer, in m."""
     size_m: tuple[float, float]
-    """Lengths of a cell along and across the wires, m."""
+    """Size of a cell along and across the wires, in m."""
     shape: tuple[int, int]
-    """Number of cells across and along the wires; their product is Q."""
+    """Numbers of cells across and along the wires; their product is Q."""
 
     @classmethod
     def of(cls, layout: PatchLayout) -> LoadCells:
@@ -65,11 +65,11 @@ class LoadCells:
         return cls(cell, frame, own, flat, height, size, shape)
 
     def displacement(self, compliance: Float) -> Float:
-        """Return the displacements (E, 3, Q, L) per unit load in the axes of the patch, m.
+        """Return the displacements (E, 3, Q, L) per unit load in the axes of the patch, in m.
 
         Args:
             compliance: (E, Q, 3, L) displacements per unit load along the tangents and the normal of the
-                electrode, m.
+                electrode, in m.
         """
         return np.asarray(np.einsum("eti,eqtl->eiql", self.electrode_frame, compliance))
 
@@ -77,8 +77,8 @@ class LoadCells:
 def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     """Return the sites of the cells, the steps along and across the wires, and the surface normals.
 
-    The lattice consists of the electrode sites and :data:`MARGIN` further rows at each edge. Each array has
-    the shape (U + 2 MARGIN, N + 2 MARGIN, 3). Sites and steps are in m. The normals are unit vectors that
+    The lattice consists of the electrode sites and :data:`MARGIN` additional rows at each edge. Each array
+    has the shape (U + 2 MARGIN, N + 2 MARGIN, 3). Sites and steps are in m. The normals are unit vectors that
     point away from the lower layer.
     """
     site = layout.upper_m
@@ -91,7 +91,7 @@ def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire with one electrode has no direction; derive one
+    else:  # a wire with one electrode has no direction; derive it
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:
@@ -118,7 +118,7 @@ def _sized(direction: Float, length: float) -> Float:
 def _carried_on(
     fields: tuple[Float, Float, Float, Float], axis: int, step: Float
 ) -> tuple[Float, Float, Float, Float]:
-    """Add :data:`MARGIN` rows at each end of ``axis``; extrapolate sites, repeat steps and normals."""
+    """Add :data:`MARGIN` rows at each end of ``axis``: extrapolated sites, repeated steps and normals."""
     pad = [(MARGIN, MARGIN) if i == axis else (0, 0) for i in range(3)]
     site, along, across, normal = fields
     along, across, normal = (np.pad(field, pad, mode="edge") for field in (along, across, normal))

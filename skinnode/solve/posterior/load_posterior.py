@@ -24,7 +24,7 @@ layouts)."""
 
 
 class LoadPosterior:
-    """Posterior of the loads on one patch in the last frame that the estimator solved.
+    """Posterior of the loads on one patch in the last frame solved by the estimator.
 
     Args:
         estimator: Estimator of the patch.
@@ -38,7 +38,7 @@ class LoadPosterior:
         self.reset()
 
     def reset(self) -> None:
-        """Free the memory of the last frame's covariance."""
+        """Free the memory used by the last frame's covariance."""
         self._whitened = np.empty((0, self._stiffness.size))
         self._factors = -1  # serial number of the factors to which the cached arrays belong
 
@@ -53,7 +53,7 @@ class LoadPosterior:
         return self._prior.loads(self._estimator.free_displacement())
 
     def expected(self, least: float) -> Float:
-        """Return the prior variances (Q,) of the loads for the next solve, pitch²; none is below ``least``.
+        """Return the prior variances (Q,) of the loads for the next solve, in pitch²; minimum ``least``.
 
         Let k = Σ (L⁻¹ J G)² be the sensitivity of the data to a load with posterior mean q and prior variance
         s². Without its own prior, the estimate of the load is q / (s² k), with variance 1/k − s² (Tipping and

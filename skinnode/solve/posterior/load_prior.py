@@ -1,7 +1,7 @@
 """Prior of the loads on a patch, and of the displacement that they cause.
 
 The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
-the prior expects loads mainly at the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
+the prior expects loads mainly in the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
 where they were found (:meth:`LoadPrior.localise`). The skin next to a contact is then estimated to move only
 as far as the contact's loads require. In tests, expecting loads where they were found reduced displacement
 errors by a factor of two to three.
@@ -27,7 +27,7 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 PRIOR_DOUBT: Final = 3.0
-"""Factor applied to the part of the variance that depends on the prior; accounts for the uncertainty of the
+"""Factor applied to the part of the variance that depends on the prior; accounts for the uncertainty in the
 expected loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement
 errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
 SMOOTH_SHARE: Final = 0.25
@@ -35,19 +35,20 @@ SMOOTH_SHARE: Final = 0.25
 less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
 displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 DISC_SLACK: Final = 0.07
-"""Standard deviation of the displacement that loads in discs do not explain, independent at each electrode,
-relative to the displacement expected there. With 0, an error exceeded five standard deviations in one of ten
-dents; with 0.1, in none of 30."""
+"""Standard deviation of the part of the displacement not explained by loads in discs, relative to the
+expected displacement; independent for each electrode. With 0, an error exceeded five standard deviations in
+one of ten dents; with 0.1, in none of 30."""
 DISC_DOUBT: Final = 2.5
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
 DISC_SHARE: Final = 0.8
 """Value of :data:`SMOOTH_SHARE` for a prior with discs."""
 DISC_FAINT: Final = 0.05
-"""Load variance that discs add to a cell, relative to that of untouched skin, below which it is neglected."""
+"""Load variance, relative to that of untouched skin, below which the discs' contribution to a cell is
+neglected."""
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation of the Gaussian that spreads squared loads over neighbouring cells, in cells. A smaller
-value improves the displacement if the rubber behaves like a half-space; otherwise, the standard deviations
-become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
+value improves the displacement estimate if the rubber behaves like a half-space; otherwise, the standard
+deviations become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells where no load was found, relative to the mean over the patch. A positive
 value accounts for light touches near a press."""
@@ -56,9 +57,9 @@ LOCAL_CHANGE: Final = 0.35
 displacement errors reached 6 standard deviations with a fraction of 0.5. With 0.25, the prior was rebuilt
 twice as often."""
 LOCAL_SURPRISE: Final = 16.0
-"""Ratio of the squared load to the expected squared load of a cell, above which the prior is rebuilt even if
-the load locations have hardly changed. Without this limit, displacement errors reached 7 standard deviations
-when the depth of a press doubled in one frame."""
+"""Ratio of a cell's squared load to its expected squared load, above which the prior is rebuilt even if the
+load locations have hardly changed. Without this limit, displacement errors reached 7 standard deviations when
+the depth of a press doubled in one frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +67,19 @@ class UniformPrior:
     """Prior of the free coordinates for equal expected loads at s = 1; shared by all patches of a layout."""
 
     response: Float
-    """(U f, 3Q) displacement per unit load, pitches."""
+    """(U f, 3Q) displacement per unit load, in pitches."""
     response_t: Float
     """(3Q, U f) transposed response."""
     covariance: Float
-    """(U f, U f) matrix C, pitch²."""
+    """(U f, U f) matrix C, in pitch²."""
     root: Float
-    """(U f, U f) array with the Cholesky factor of C."""
+    """(U f, U f) array containing the Cholesky factor of C."""
     blur: Float
     """(Q, Q) weights of a Gaussian blur over the cells."""
 
     @classmethod
     def of(cls, elastic: ElasticPrior, free: Index) -> UniformPrior:
-        """Return the prior of the coordinates ``free`` (U f,) from a cache; computed on first use."""
+        """Return the cached prior of the coordinates ``free`` (U f,), computing it on first use."""
         return _uniform_prior(elastic, free.tobytes())
 
 
@@ -104,14 +105,14 @@ class LoadPrior:
         free: (U f,) indices of the free coordinates.
 
     Attributes:
-        scale2: s², pitch².
+        scale2: s², in pitch².
         share: (Q,) load variance of each cell, relative to s²; the mean is 1.
         covariance: (U f, U f) matrix C; read-only.
         uniform: (U f, U f) matrix C for equal expected loads over the whole patch; read-only.
-        response: (U f, 3Q) displacement per unit load, pitches.
+        response: (U f, 3Q) displacement per unit load, in pitches.
         doubt: Factor applied to the part of the variance that depends on the prior.
         smooth_share: Value of ``doubt`` for the 95 % interval.
-        version: Number of times that C has been rebuilt.
+        version: Number of times C has been rebuilt.
     """
 
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
@@ -137,7 +138,7 @@ class LoadPrior:
         """Set the variances of the loads, and rebuild the prior if they have changed enough.
 
         Args:
-            variance: (Q,) load variance of each cell, pitch².
+            variance: (Q,) load variance of each cell, in pitch².
 
         Returns:
             Whether the prior was rebuilt.
@@ -160,9 +161,10 @@ class LoadPrior:
         """Set the load variances for a skin that is untouched except for discs on a few cells.
 
         Args:
-            variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, pitch².
-            layer: (U f, Q) displacement per unit load on a bonded layer, pitches.
-            untouched2: Variance of the half-space loads on untouched skin, pitch².
+            variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, in
+                pitch².
+            layer: (U f, Q) displacement per unit load on a bonded layer, in pitches.
+            untouched2: Variance of the half-space loads on untouched skin, in pitch².
         """
         loaded = variance[0] > DISC_FAINT * untouched2
         own = np.where(loaded, variance[0], 0.0) + untouched2
@@ -184,13 +186,13 @@ class LoadPrior:
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
         """Return the load variances (Q,) for the next solve, in pitch².
 
-        Each variance moves halfway from its current value to the value for the loads found. With full steps,
-        the variances of neighbouring cells would oscillate. A full step is taken only from equal expected
-        loads, and only if a press is certain.
+        Each variance moves halfway from its current value to the value indicated by the loads found. With
+        full steps, the variances of neighbouring cells would oscillate. A full step is taken only from equal
+        expected loads, and only if a press is certain.
 
         Args:
-            found: (Q,) squared loads found in the frame, pitch².
-            least: Minimum variance, pitch².
+            found: (Q,) squared loads found in the frame, in pitch².
+            least: Minimum variance, in pitch².
             certain: Whether a press is certain.
         """
         floor = LOCAL_FLOOR * float(found.mean()) + least
@@ -205,7 +207,7 @@ class LoadPrior:
         """Return the mean loads for a given displacement.
 
         Args:
-            displacement: (U f,) free coordinates, pitches.
+            displacement: (U f,) free coordinates, in pitches.
 
         Returns:
             (Q, 3) mean loads, in units of the prior's loads.
@@ -228,7 +230,7 @@ class LoadPrior:
         return float(displacement @ displacement)
 
     def _own_covariance(self) -> Float:
-        """Return C as an array that may be modified; the uniform prior is shared."""
+        """Return a private array for C; replace the shared array of the uniform prior if necessary."""
         if self.covariance is self.uniform:
             self.covariance, self._root = np.empty_like(self.uniform), np.empty_like(self.uniform)
         return self.covariance

@@ -1,4 +1,4 @@
-"""MAP estimate of one frame, by Gauss-Newton steps, chord steps and annealing.
+"""MAP estimate for one frame, computed by Gauss-Newton steps, chord steps and annealing.
 
 - Chord steps start at the last field and reuse the factors of an earlier frame. A typical solve needs two
   evaluations of F and its Jacobian.
@@ -67,11 +67,11 @@ EFFECT_STEP: Final = 0.2
 """Relative change in the effects of the geometry errors (root sum of squares) above which the factors are
 recomputed. Below this limit, the standard deviations change by less than 20 %."""
 HALVINGS: Final = 6
-"""Maximum number of times that a Gauss-Newton step is halved."""
+"""Maximum number of times a Gauss-Newton step is halved."""
 
 
 class MapEstimator:
-    """MAP estimator of one patch, with its displacement, nuisances and last factors.
+    """MAP estimator of one patch; holds the displacement, the nuisances and the last factors.
 
     Each stream needs its own instance.
 
@@ -84,17 +84,17 @@ class MapEstimator:
 
     Attributes:
         load_prior: Prior of the loads and of the displacement.
-        moved: (U, 3N) displacement, pitches; 0 for fixed coordinates.
+        moved: (U, 3N) displacement, in pitches; 0 for fixed coordinates.
         g: The p nuisances, followed by the geometry errors.
-        std: (U, f) standard deviations from the last factors, pitches.
-        core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
-        noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
+        std: (U, f) standard deviations from the last factors, in pitches.
+        core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, in pitches.
+        noise_variance: (U f,) variance of the displacement due to noise and nuisances, in pitch².
         members: Wires whose equations are in the factors.
         factors: Serial number of the current factors.
         evaluations: Number of evaluations of F and its Jacobian, per wire. The caller resets the counter.
         factorisations: Number of factorisations. The caller resets the counter.
-        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A solve that exceeds the
-            deadline raises TimeoutError.
+        until: Deadline on the clock :func:`skinnode.process.clock.perf_counter`, in s. A solve that exceeds
+            the deadline raises TimeoutError.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class MapEstimator:
         )
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # convergence tolerance for the RMS of a chord step, pitches
+        self._enough = math.inf  # convergence tolerance for the RMS of a chord step, in pitches
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
@@ -150,7 +150,7 @@ class MapEstimator:
     def reset(self, scale2: float) -> None:
         """Return to rest, and expect equal loads everywhere with s² = ``scale2`` in pitch².
 
-        The memory of the factors is freed, so that a hand needs memory only for the patches in contact.
+        The factors' memory is freed, so that a hand needs memory only for the patches in contact.
         """
         self.moved[:] = 0.0
         self.g[:] = 0.0
@@ -168,7 +168,7 @@ class MapEstimator:
     # -- solving ---------------------------------------------------------------------------------------
 
     def track(self, observation: Observation, members: Index) -> bool:
-        """Solve from the current displacement with the equations of the wires ``members`` (P,).
+        """Solve from the current displacement, using the equations of the wires ``members`` (P,).
 
         Returns:
             True if the solve converged; False if it found no maximum nearby.
@@ -232,7 +232,7 @@ class MapEstimator:
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None stands for rest."""
+        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None means at rest."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -245,7 +245,7 @@ class MapEstimator:
     def objective(
         self, observation: Observation, moved: Float | None = None, g: Float | None = None
     ) -> float:
-        """Return −2 log posterior of the current or a given field, up to a constant."""
+        """Return −2 log posterior for the current or a given field, up to a constant."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
         square = self._square(observation, self.members, moved, g)
         prior = self.roughness(moved) / self.load_prior.scale2
@@ -342,11 +342,11 @@ class MapEstimator:
         return self._gamma
 
     def evidence_scale(self, weight: float, scale2: float) -> float:
-        """Return the next s², in pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
+        """Return s², in pitch², after one more MacKay iteration (Neural Computation 4, 415, 1992).
 
         Args:
             weight: Weight of the prior on s², as an equivalent number of parameters.
-            scale2: Value of s² expected by this prior, pitch².
+            scale2: Value of s² expected by this prior, in pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
 
@@ -362,7 +362,7 @@ class MapEstimator:
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Return whether the current factors are valid for the given wires and noise, and for the prior."""
+        """Return whether the current factors are valid for the given wires, the noise and the prior."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored

@@ -3,11 +3,11 @@
 The update works in data space, like the measurement update of a Kalman filter.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
-g ~ N(0, diag(d)). A wire has the residual r = w (a F(x) − 1) with w = 1/σ. The model is
+g ~ N(0, diag(d)). Each wire has the residual r = w (a F(x) − 1) with w = 1/σ. The model is
 
     r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
-Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from x leads to
+Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from x yields
 
     x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
 
@@ -54,7 +54,7 @@ from skinnode.solve.posterior.geometry_error import add_effect, effect_on
 
 
 class Buffers(NamedTuple):
-    """Arrays that a Gauss-Newton step writes, for one patch.
+    """Arrays written by a Gauss-Newton step, for one patch.
 
     Each of the U wires has K equations and f free coordinates; there are p nuisances. A reduced wire has R =
     min(K, f + p) rows. With geometry errors, R = K. The large arrays of the factors (``cross_covariance``,
@@ -105,7 +105,7 @@ class Buffers(NamedTuple):
 def make_buffers(  # noqa: PLR0913 - the sizes of a patch
     wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
 ) -> Buffers:
-    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are for one wire."""
+    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are per wire."""
     columns = free + nuisances
     rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
@@ -127,7 +127,7 @@ def with_factors(b: Buffers) -> Buffers:
 
 
 def without_factors(b: Buffers) -> Buffers:
-    """Return the buffers with empty arrays instead of the factors. No kernel may use them."""
+    """Return the buffers with empty arrays instead of the factors. Kernels must not use them."""
     return _resized(b, 0)
 
 
@@ -158,7 +158,7 @@ def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> N
 
 @njit
 def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """Replace F and its Jacobian by r = w (a F − 1) and the Jacobian of r."""
+    """Replace F and its Jacobian with r = w (a F − 1) and the Jacobian of r."""
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
@@ -193,7 +193,7 @@ def residuals(  # noqa: PLR0913 - a kernel: arrays by name
 def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
     free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
 ) -> None:
-    """Compute the misfit of the residuals ``r`` (U, K), and replace ``r`` by r − H g.
+    """Compute the misfit of the residuals ``r`` (U, K), and replace ``r`` with r − H g.
 
     Three results are written: the χ² of each wire into ``square_sum`` (U,); the error |Jᵢᵀ r| / ‖Jᵢ‖² of each
     coordinate i, with all other coordinates fixed, into ``move`` (U, f); and the largest error of each wire
@@ -333,7 +333,7 @@ def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
 def noise_variance(  # noqa: C901 - a kernel: sums as loops
     m: int, d: Float, b: Buffers, kalman_gain_t: Float, out: Float
 ) -> None:
-    """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
+    """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), in pitch².
 
     The variance is diag(K (I + H d Hᵀ) Kᵀ). The transposed Kalman gain Kᵀ = L⁻ᵀ V, the change in the estimate
     per unit of noise in each equation, is written to ``kalman_gain_t`` (m, U f). V and L are read from ``b``.
@@ -400,7 +400,7 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     """Write a chord step with the current factors into ``step``: U f coordinates, followed by the nuisances.
 
     The residuals r, Jᵀ and the effects of the geometry errors at ``x`` (U, 3N) are read from ``b``. Returns
-    the RMS and the largest absolute value of the changes in the coordinates, pitches.
+    the RMS and the largest absolute value of the changes in the coordinates, in pitches.
     """
     f, p = free.size, h.shape[2]
     wires, equations = b.r.shape

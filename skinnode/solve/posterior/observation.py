@@ -1,10 +1,9 @@
 """Observation model of a frame: residuals, weights, and the effects of the nuisances.
 
-A wire has the residual r = w (a F(x) − 1) with w = 1/σ. In the model, r(x) − H g is noise of variance 1,
+Each wire has the residual r = w (a F(x) − 1) with w = 1/σ. In the model, r(x) − H g is noise of variance 1,
 where H is the effect of the nuisances g ~ N(0, diag(d)). The nuisances are gain errors of the patch or of
-each wire (drift), an error of the forward model in proportion to the change in each resistance, and errors of
-the geometry. For the geometry errors, H depends on the displacement
-(:mod:`skinnode.solve.posterior.geometry_error`).
+each wire (drift), a forward-model error proportional to the change in each resistance, and geometry errors.
+For the geometry errors, H depends on the displacement (:mod:`skinnode.solve.posterior.geometry_error`).
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ class Readings:
     """Resistances of one frame, in the units of :class:`PatchProblem`."""
 
     a: Float
-    """(U, K) resistances times gain, R · gain; the value at rest where a resistance is unusable."""
+    """(U, K) resistances times gain, R · gain; the rest value where a resistance is unusable."""
     noise: Float
     """(U, K) relative standard deviation of the resistances R."""
     usable: NDArray[np.bool_]
@@ -47,14 +46,14 @@ class Readings:
 
 @dataclass
 class Observation:
-    """Input of the estimator for one frame, with U wires, K resistances per wire and p nuisances."""
+    """Estimator input for one frame, with U wires, K resistances per wire and p nuisances."""
 
     a: Float
     """(U, K) resistances times gain, R · gain."""
     weight: Float
     """(U, K) weights 1/σ of the resistances; 0 where a resistance is missing."""
     h: Float
-    """(U, K, p) H, effect of a unit of each nuisance on the residuals, without the geometry errors."""
+    """(U, K, p) H: effect of a unit of each nuisance on the residuals, without the geometry errors."""
     d: Float
     """Prior variances of the p nuisances, followed by those of the geometry errors."""
 
@@ -65,7 +64,7 @@ class Observation:
 
 
 class ObservationModel:
-    """Conversion of readings to observations.
+    """Converts readings to observations.
 
     Args:
         problem: The patch.

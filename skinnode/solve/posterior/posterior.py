@@ -1,4 +1,4 @@
-"""Posterior of a patch: estimate fields from a stream of frames, and test the readings of each frame.
+"""Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
 
 ``frame_estimator`` solves each frame. :mod:`skinnode.solve.checks.data_check` then tests whether the readings
 contradict each other. If some readings are wrong, the frame is solved again without them.
@@ -26,22 +26,22 @@ reading."""
 
 
 class Posterior(FrameEstimator):
-    """Estimator of the displacement, loads and contacts of one patch, frame by frame.
+    """Estimates the displacement, loads and contacts of one patch, frame by frame.
 
     Each stream needs its own instance. The constructor compiles the kernels, which release the GIL.
 
     Args:
         layout: The patch, with any number of lower wires.
-        options: Options of the estimate; :class:`skinnode.solve.options.PosteriorOptions()` by default.
+        options: Estimation options; :class:`skinnode.solve.options.PosteriorOptions()` by default.
         **arguments: Options by name; these take precedence over ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
         check: Data check of the readings.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 if no deadline is set.
-        noise_estimate: Estimate of the stream's noise, by which the stated noise is scaled; None if the
-            stated noise is used as it is.
+        from_rest_s: Minimum time to solve a touched frame from rest, in s; 0 if no deadline is set.
+        noise_estimate: Estimate of the stream's noise, used to scale the stated noise; None if the stated
+            noise is used unchanged.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -75,16 +75,16 @@ class Posterior(FrameEstimator):
         No resistance value raises an exception. If a wire has no usable resistances, its displacement is
         estimated from its neighbours, and its standard deviation is larger. If no deformation explains the
         resistances of a wire, the wire is INCONSISTENT and left out of the estimate. A wire that does not
-        converge even when solved alone is MAX_STEPS and also left out. If the whole frame cannot be solved,
-        the last trusted field is returned with an infinite standard deviation.
+        converge even when solved alone has the status MAX_STEPS and is also left out. If the whole frame
+        cannot be solved, the last trusted field is returned with an infinite standard deviation.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm. Values that are not positive and finite are ignored.
-            valid: (U, K) bool, False where a reading is missing; all True by default.
+            frame_ohm: (U, K) resistances, in ohms. Values that are not positive and finite are ignored.
+            valid: (U, K) bool: False where a reading is missing; all True by default.
             relative_noise: Relative noise of this frame only, a number or (U, K). Resistances whose noise is
                 not positive and finite are ignored.
-            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, ohm. It is
-                combined with ``relative_noise`` as independent noise.
+            rounding_ohm: (U, K) standard deviation of the quantization error of the codes, in ohms. This
+                noise and ``relative_noise`` are treated as independent.
 
         Returns:
             The field, with one status per wire.
@@ -108,7 +108,7 @@ class Posterior(FrameEstimator):
 
 
 def _model_std(options: PosteriorOptions) -> float:
-    """Return the forward model's standard error under the options, relative to the largest change."""
+    """Return the forward model's standard error for the given options, relative to the largest change."""
     made = options.tolerances or EXACT
     placed = PLACED * math.hypot(made.placement, made.electrode_radius)
     return math.hypot(options.model_error, placed, made.thickness, made.gain)

@@ -24,7 +24,8 @@ from skinnode.solve.wires.problem import PatchProblem
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-# Columns of the integer report on a wire. SPARE is the number of equations in use minus that of unknowns.
+# Columns of the integer report on a wire. SPARE is the number of equations in use minus the number of
+# unknowns.
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
 # Columns of the floating-point report on a wire. RESIDUAL is the weighted RMS residual of the equations in
 # use. CHI2 is the χ² of the final residual, with SPARE degrees of freedom.
@@ -33,13 +34,13 @@ RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 # Index of the relative noise in a code map
 NOISE: Final = 3
 
-# Actions for a wire in a call of the solver
+# Actions for a wire in one call of the solver
 LEAVE: Final = 0
 SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) Δa, where Δa is the change in a since the last solve."""
 HOLD: Final = 3
-"""Keep x if the residual at x does not exceed the noise; otherwise, do the same as for PREDICT."""
+"""Keep x if the residual at x does not exceed the noise; otherwise, proceed as for PREDICT."""
 
 # Optional tasks of a solve; combine them with bitwise OR
 COVARIANCE: Final = 1
@@ -101,7 +102,7 @@ class SolverArrays(ArrayTable):
     report: Annotated[Index, "U report"]
     measure: Annotated[Float, "U measures"]
     tally: Annotated[Index, "3"]
-    """Numbers of evaluations of F, evaluations of J, and steps since the array was last set to 0."""
+    """Numbers of F evaluations, J evaluations and steps since the array was last set to 0."""
     lower: Annotated[Float, "3 M K", READONLY]
     electrodes: Annotated[Index, "U N"]
     """Indices of each wire's electrodes; the electrodes with unknowns come first."""
@@ -110,9 +111,9 @@ class SolverArrays(ArrayTable):
     still_std: Annotated[Float, "U 3N"]
     """Standard deviations of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
-    """Frame number, which determines the wires that compute a new inverse despite REUSE."""
+    """Frame number, which determines which wires compute a new inverse despite REUSE."""
     step_limit: float
-    """Initial trust radius, pitches per coordinate."""
+    """Initial trust radius, in pitches per coordinate."""
     point: Annotated[Float, "3E"]
     """Positions of the electrodes that have unknowns."""
     raw: Annotated[Float, "3E K"]
@@ -121,14 +122,15 @@ class SolverArrays(ArrayTable):
 
 
 class FrameArrays(ArrayTable):
-    """Current frame of a patch, and its last trusted solution."""
+    """Current frame and last trusted solution of a patch."""
 
     codes: Annotated[NDArray[np.uint32], "U K"]
     baseline_ohm: Annotated[Float, "U K"]
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """R/R0 at code 0, change in R/R0 per code, largest valid code, relative noise before the converter."""
+    """R/R0 at code 0, change in R/R0 per code, largest valid code, and relative noise before the
+    converter."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
     """Relative standard deviation of each resistance."""
@@ -141,7 +143,7 @@ class FrameArrays(ArrayTable):
     """Weight of each equation: the frame's smallest relative standard deviation divided by that of the
     resistance. The weight is 0 if the resistance is invalid or its standard deviation is unknown."""
     used: Annotated[Float, "U K"]
-    """As ``weight``, but also 0 if ``a`` is out of range."""
+    """Like ``weight``, but also 0 if ``a`` is out of range."""
     todo: Annotated[Bytes, "U"]
     """Action for each wire: LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]
@@ -167,16 +169,16 @@ class FrameArrays(ArrayTable):
     """Mask of the wires with an acceptable root."""
     status: Annotated[Index, "U"]
     moved_m: Annotated[Float, "U 3N"]
-    """Displacement of each coordinate, m."""
+    """Displacement of each coordinate, in m."""
     std_m: Annotated[Float, "U 3N"]
-    """Standard deviation of ``moved_m``, m."""
+    """Standard deviation of ``moved_m``, in m."""
     held: Annotated[Mask, "U"]
 
     def __init__(self, problem: PatchProblem, rest_branch: Index, unknowns: Index, first: int) -> None:
         shape, rest = problem.layout.shape, problem.rest
         upper = shape[0]
         self.outcome_m = np.empty((2, *problem.layout.upper_m.shape))
-        """(2, U, N, 3) displacements of the electrodes and their standard deviations, m."""
+        """(2, U, N, 3) displacements of the electrodes and their standard deviations, in m."""
         moved_m, std_m = self.outcome_m.reshape(2, *rest.shape)
         baseline_ohm, code_gain, rounding_ohm = np.ones((3, *shape))
         ohm, noise, a, weight, used = np.empty((5, *shape))
@@ -213,11 +215,11 @@ class FrameArrays(ArrayTable):
         )
 
     def set_codes(self, codes: CodeMap) -> None:
-        """Set the mapping of codes to resistances."""
+        """Set the mapping from codes to resistances."""
         self.baseline_ohm[:], self.rounding_ohm[:] = codes.baseline_ohm, codes.rounding_ohm
         self.code_gain[:] = 1.0 if codes.gain is None else codes.gain
         self.code_map[:] = codes.lo, codes.step, codes.steps, codes.relative_noise
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""Functions with which kernels access the arrays of a table."""
+"""Functions that kernels use to access the arrays of a table."""

@@ -1,6 +1,6 @@
 """Compiled corrector: solves r = w (a F − 1) = 0 for one wire by Newton-like iteration.
 
-The unknowns are coordinates of the wire's electrodes. Some electrodes may be fixed at rest, and x and y may
+The unknowns are coordinates of the wire's electrodes. Some electrodes can be fixed at rest, and x and y can
 be fixed (``normal_only``). A system with more equations than unknowns is called tall.
 
 The solution of a tall system minimises χ² = Σ (ρ_k/σ_k)². Here ρ_k = a_k F_k − 1 is the relative residual,
@@ -119,9 +119,9 @@ def correct(  # noqa: PLR0913 - one wire of a call
 ) -> tuple[int, int, int, int, bool]:  # fmt: skip
     """Solve wire ``u``, starting at ``x`` in the workspace, until the iteration converges or fails.
 
-    ``steps`` is the number of steps that the wire has already taken in this frame. Returns the status, the
-    number of evaluations of F, the number of evaluations of J, the total number of steps, and whether the
-    wire was skipped (see SKIP).
+    ``steps`` is the number of steps already taken for this wire in this frame. Returns the status, the number
+    of evaluations of F, the number of evaluations of J, the total number of steps, and whether the wire was
+    skipped (see SKIP).
     """
     w: Any = solver.work
     operator, tasks, tol_f, tol_x = options.operator, options.tasks, options.tol_f, options.tol_x

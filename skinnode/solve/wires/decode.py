@@ -16,8 +16,7 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Limits of the scaled resistance a. All plausible values are within these limits; at rest, a is about
-1 / (N M)."""
+"""Limits on the scaled resistance a. All plausible values are within them; at rest, a is about 1 / (N M)."""
 
 
 @njit_part
@@ -50,8 +49,8 @@ def decode(frame: FrameArrays) -> int:
 def scale(frame: FrameArrays, sigma: float) -> float:
     """Compute ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns the smallest relative standard deviation of the frame's resistances, or ``sigma`` if all of them
-    are unknown.
+    Returns the smallest relative standard deviation of the frame's resistances, or ``sigma`` if none is
+    known.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

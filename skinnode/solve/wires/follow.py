@@ -2,7 +2,7 @@
 
 The solver takes simplified Newton steps, which do not evaluate J (Deuflhard, Newton methods for nonlinear
 problems, 2004, section 2.1). If successive steps shrink quickly, the inverse is still accurate, and the
-standard deviations are computed from it too.
+standard deviations are also computed from it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FRESH: Final = 0.01
 
 @njit_part
 def newton_step(inverse: Float, rho: Float, step: Float) -> float:
-    """Compute ``step`` (n,), −Σ_k (∂x_j/∂r_k) ρ_k; return its maximum norm."""
+    """Compute ``step`` (n,) = −Σ_k (∂x_j/∂r_k) ρ_k; return its maximum norm."""
     for j in range(step.size):
         row, along = inverse[j], splat(0.0)
         for k in range(0, rho.size, LANES):
@@ -37,7 +37,7 @@ def newton_step(inverse: Float, rho: Float, step: Float) -> float:
 
 @njit_part
 def standard_deviations(inverse: Float, variance: Float, std: Float) -> None:
-    """Compute the standard deviations ``std`` (n,), √Σ_k (∂x_j/∂r_k)² σ_k²."""
+    """Compute the standard deviations ``std`` (n,) = √Σ_k (∂x_j/∂r_k)² σ_k²."""
     for j in range(std.size):
         row, square = inverse[j], splat(0.0)
         for k in range(0, variance.size, LANES):

@@ -1,13 +1,13 @@
 """Compiled test that decides whether to hold a wire.
 
-A wire is held, which means that it keeps its last position x without being solved again, if its resistances
-have changed by no more than their noise. The test uses the residuals ρ_k = a_k F_k(x) − 1, where F_k(x) is
-known from the solve for x. The wire is held if Σ (ρ_k/σ_k)² is below its 99 % quantile.
+A held wire keeps its last position x without being solved again. A wire is held if its resistances have
+changed by no more than their noise. The test uses the residuals ρ_k = a_k F_k(x) − 1, where F_k(x) is known
+from the solve for x. The test is passed if Σ (ρ_k/σ_k)² is below its 99 % quantile.
 
 The noise of two frames contributes to ρ. The noise of the current frame has the variance σ². The noise of the
 frame for which x was solved has the variance s², and contributes only in the n dimensions of the range of J.
-With t = s²/σ², the sum has the mean K + n t and the variance 2 (K + 2 n t + n t²). The quantile is that of a
-scaled distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
+With t = s²/σ², the sum has the mean K + n t and the variance 2 (K + 2 n t + n t²). The quantile is taken from
+a scaled distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
 The test can miss a slow movement, so the variance of a held coordinate includes an estimate of the movement.
 The correction c = Σ_k (∂x_j/∂r_k) ρ_k of the coordinate is the sum of the movement and the noise of the two
@@ -33,10 +33,10 @@ solved again."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:
-    """Return the χ² quantile for the probability of the standard normal quantile ``z``.
+    """Return the χ² quantile with the same probability as the standard normal quantile ``z``.
 
-    The approximation is that of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more
-    degrees of freedom. At very high probabilities, it never underestimates the quantile.
+    Uses the approximation of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more degrees
+    of freedom. At very high probabilities, it never underestimates the quantile.
 
     Args:
         dof: Degrees of freedom, greater than 0.
@@ -58,7 +58,7 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
     """Return the RMS of w ρ and compute ``std`` (n,) if the wire can be held; otherwise return −1.
 
     ``noise`` (K,) is the noise variance of the frame for which x was solved. ``rho``, ``variance`` and
-    ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
+    ``before`` (K,) are work arrays. The variance of a held coordinate is the largest of three values: the
     variance due to ``noise``, the variance due to the noise of the current frame, and the squared correction
     minus both variances.
     """

@@ -1,4 +1,4 @@
-"""Solver for all wires of a patch: its buffers, and one compiled function for all stages of a frame.
+"""Solver for all wires of a patch: buffers, and a compiled function that runs all stages of a frame.
 
 All stages run in a single call, because passing arguments from Python to compiled code takes longer than most
 of the stages.
@@ -47,10 +47,10 @@ STORE: Final = 32
 # Flags that a call returns, combined with bitwise OR
 ALL_GOOD: Final = 1
 INCOMPLETE: Final = 2
-"""A new trusted solution was stored in which the weight of some equation was 0."""
+"""A new trusted solution was stored in which at least one equation has weight 0."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance of the solve at the rest position, where the residual consists of rounding errors only."""
+"""Tolerance of the solve at the rest position, where the residual consists only of rounding errors."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -110,23 +110,23 @@ class PatchSolver:
         self.problem = problem
         self.operator = operator
         self.x = problem.rest.copy()
-        """(U, 3N) positions, pitches: starting points before a solve, solutions after it."""
+        """(U, 3N) positions, in pitches: starting points before a solve, solutions after it."""
         self.inverse = np.zeros((upper, unknowns, lower))
         self.a_solved = np.ones((upper, lower))
         self.noise = np.zeros((upper, lower))
         self.std = np.full((upper, unknowns), np.inf)
-        """(U, 3N) standard deviation of ``x``, pitches; inf if unknown."""
+        """(U, 3N) standard deviation of ``x``, in pitches; inf if unknown."""
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Numbers of evaluations of F, evaluations of J, and steps since the array was last set to 0."""
+        """Numbers of F evaluations, J evaluations and steps since the array was last set to 0."""
         self.turn = np.zeros(1, np.int64)
         """(1,) frame number, which SCALE increments.
 
-        The frame number determines the wires that compute a new inverse despite REUSE.
+        The frame number determines which wires compute a new inverse despite REUSE.
         """
         self.still_std = np.full((upper, unknowns), np.inf)
-        """(U, 3N) standard deviations of the coordinates that are not unknowns, pitches."""
+        """(U, 3N) standard deviations of the coordinates that are not unknowns, in pitches."""
         self.each = 1 if normal_only else 3
         """Number of unknowns per electrode."""
         most = unknowns // 3
@@ -156,7 +156,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Compute J⁻¹ at the rest position; return the signs of det J (U,), 0 if J is not square."""
+        """Compute J⁻¹ at the rest position; return the signs (U,) of det J, or 0 if J is not square."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)

@@ -1,8 +1,8 @@
 """Dimensionless equations of a patch: one system of equations per upper wire.
 
 Lengths are in pitches. The residuals are r_k = w_k (a_k F_k − 1). The scaled resistances are
-a_k = R_k / (R₀ F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ was measured, errors of the
-resistivity and of the front end's gain cancel; otherwise, R₀ F₀ is computed from the resistivity of the
+a_k = R_k / (R₀ F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ was measured, errors in the
+resistivity and in the front end's gain cancel; otherwise, R₀ F₀ is computed from the resistivity of the
 layout. With the weights w_k = σ_min / σ_k, the least-squares solution minimises χ². An equation with weight 0
 is ignored.
 """
@@ -24,7 +24,7 @@ TRUST_SHARE: Final = 0.25
 """Initial trust radius, relative to the smallest clearance between the layers at rest.
 
 Within this radius, F is nearly linear. From one frame of a live stream to the next, the skin moves less than
-the radius.
+this radius.
 """
 
 
@@ -34,17 +34,17 @@ class PatchProblem:
 
     layout: PatchLayout
     rest: Float
-    """(U, 3N) positions of the upper electrodes at rest, pitches."""
+    """(U, 3N) positions of the upper electrodes at rest, in pitches."""
     lower: Float
-    """(3, M, K) positions of the lower electrodes, pitches."""
+    """(3, M, K) positions of the lower electrodes, in pitches."""
     gain: Float
-    """(U, K) factors 1 / (R₀ F₀) that convert resistances in ohm to scaled resistances."""
+    """(U, K) factors 1 / (R₀ F₀) that convert resistances in ohms to scaled resistances."""
     a_rest: Float
     """(U, K) scaled resistances at rest, 1 / F₀."""
     share_at_rest: Float
     """(U, N, K) contribution of each upper electrode to F at rest."""
     clearance: Float
-    """(U, N) distance of each upper electrode from the nearest lower electrode at rest, pitches."""
+    """(U, N) distance of each upper electrode from the nearest lower electrode at rest, in pitches."""
 
     @classmethod
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
@@ -52,7 +52,7 @@ class PatchProblem:
 
         Args:
             layout: The patch.
-            baseline_ohm: (U, K) resistances measured at rest, ohm; by default, they are computed from the
+            baseline_ohm: (U, K) resistances measured at rest, in ohms; by default, they are computed from the
                 resistivity of the layout.
 
         Raises:
@@ -72,7 +72,7 @@ class PatchProblem:
 
     @property
     def step_limit(self) -> float:
-        """Initial trust radius, pitches per coordinate."""
+        """Initial trust radius, in pitches per coordinate."""
         return TRUST_SHARE * float(self.clearance.min())
 
     def displacement_m(self, x: Float) -> Float:
@@ -83,7 +83,7 @@ class PatchProblem:
         """Return a mask (U,) of the wires with an electrode farther from rest than its clearance.
 
         Such a displacement is implausible. The test rejects the roots that arise from the symmetries of F,
-        which does not change if an electrode is mirrored at the lower layer or if two electrodes of a wire
+        which does not change if an electrode is reflected in the lower layer or if two electrodes of a wire
         are exchanged.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)

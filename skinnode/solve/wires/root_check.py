@@ -25,9 +25,9 @@ class RootCheck(ArrayTable):
     """Arrays of a root check: the field to check, the limits, and the results."""
 
     moved_m: Annotated[Float, "U N 3"]
-    """Displacement in the frame to check, m."""
+    """Displacement in the frame to check, in m."""
     last_m: Annotated[Float, "U N 3"]
-    """Displacement in the previous frame, m."""
+    """Displacement in the previous frame, in m."""
     status: Annotated[Index, "U"]
     held: Annotated[Mask, "U"]
     folded: Annotated[Mask, "U"]
@@ -46,7 +46,7 @@ class RootCheck(ArrayTable):
     far_m: float
     pitch_m: float
     rough_limit: float
-    """Limit of a displacement's roughness divided by its Euclidean norm in pitches."""
+    """Limit on a displacement's roughness divided by its Euclidean norm in pitches."""
 
 
 _read = reader(RootCheck)

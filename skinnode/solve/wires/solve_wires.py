@@ -25,8 +25,8 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of successive frames in which a wire is solved with the same inverse. New inverses of
-different wires are computed in different frames."""
+"""Maximum number of successive frames in which a wire is solved with the same inverse. The inverses of
+different wires are recomputed in different frames."""
 COVARIANCE_UNITS: Final = 3.0
 """Time to compute the covariance of a square system with 30 unknowns, in units of one evaluation of F and J
 plus one step."""
@@ -130,7 +130,7 @@ def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigm
 def _solve_wire(  # noqa: C901, PLR0913 - one wire of a call, from start to report
     u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
 ) -> float:
-    """Solve wire ``u``; return the estimated time spent, in the unit of ``COVARIANCE_UNITS``."""
+    """Solve wire ``u``; return the estimated time spent, in the same unit as ``COVARIANCE_UNITS``."""
     w: Any = solver.work
     point, x_u, electrodes = solver.point, solver.x[u], solver.electrodes[u]
     report, measure, std = solver.report[u], solver.measure[u], solver.std[u]
@@ -208,8 +208,8 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
         weight: (U, K) weights of the equations; an equation with weight 0 is ignored.
         order: (U,) indices of the wires, in the order in which to solve them.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-        units: Time limit, in units of one evaluation of F and J plus one step. The call returns before a wire
-            whose solve could exceed the limit.
+        units: Time limit, in units of one evaluation of F and J plus one step. The call returns before
+            starting a wire whose solve could exceed the limit.
 
     Returns the estimated time spent, in the same unit as ``units``. A wire with fewer usable equations than
     unknowns is not solved; its status is NON_FINITE if a value of ``a`` is out of range, otherwise

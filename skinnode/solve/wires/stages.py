@@ -17,7 +17,7 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Factor by which a weight of a tall system may change before the pseudoinverse J⁺ is recomputed."""
+"""Factor by which a weight of a tall system can change before the pseudoinverse J⁺ is recomputed."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 

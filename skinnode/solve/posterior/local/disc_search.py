@@ -7,7 +7,7 @@ load matches the remaining data best, as long as the gain in evidence outweighs 
 a stream, the search starts at the discs of the last frame.
 
 No disc is used if equal loads over the whole patch explain the frame better than the discs, or if the loads
-need many or large discs.
+require many or large discs.
 """
 
 from __future__ import annotations
@@ -34,37 +34,38 @@ over the whole patch."""
 LAYER_RANGE: Final = (0.02, 5.0)
 """Minimum and maximum layer share β."""
 BEYOND: Final = 1
-"""Maximum distance of a disc's centre beyond the outermost electrodes, cells."""
+"""Maximum distance of a disc's centre beyond the outermost electrodes, in cells."""
 AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 REACH: Final = 4.5
-"""Radius around the start of a search within which the effects of loads are computed, cells."""
+"""Radius around the start of a search within which the effects of loads are computed, in cells."""
 MOST: Final = 4
-"""Number of discs at which the search is abandoned. Loads that need so many discs are not local."""
+"""Number of discs at which the search is abandoned. Loads that require this many discs are not local."""
 WIDE: Final = 3.0
-"""Disc radius above which the search is abandoned, cells. For large contacts and plates, the standard
+"""Disc radius above which the search is abandoned, in cells. For large contacts and plates, the standard
 deviations from discs would be too small."""
 PAYS: Final = 2.0
-"""Minimum gain in log evidence for a further disc, in excess of the logarithm of the number of parameters."""
+"""Minimum gain in log evidence for adding another disc, in excess of the logarithm of the number of
+parameters."""
 NOTICED: Final = 8.0
-"""Minimum squared match between a load and the remaining data at which a further disc is tried, in noise
+"""Minimum squared match between a load and the remaining data at which another disc is tried, in noise
 variances."""
 NEAR: Final = 1.0
-"""Radius of the discs that are matched to the data to find a starting point, cells."""
+"""Radius of the discs that are matched to the data to find a starting point, in cells."""
 
 
 class DiscPrior:
-    """Discs of expected loads on one patch. Each stream needs its own instance.
+    """Discs that model the expected loads on one patch. Each stream needs its own instance.
 
     Args:
         estimator: MAP estimator of the patch.
         shape: Numbers of cells across and along the wires.
-        clearance: Median clearance, pitches.
-        layer: (U f, Q) displacement per unit load on a bonded layer, pitches.
+        clearance: Median clearance, in pitches.
+        layer: (U f, Q) displacement per unit load on a bonded layer, in pitches.
 
     Attributes:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
-        spread: (U f,) variance of the displacement due to the uncertainty of the discs, pitch².
+        spread: (U f,) variance of the displacement due to the uncertainty of the discs, in pitch².
     """
 
     def __init__(
@@ -97,7 +98,7 @@ class DiscPrior:
         self.spread = np.zeros(len(self._prior.response))
 
     def reset(self) -> None:
-        """Forget the discs."""
+        """Discard the discs."""
         self.discs = np.empty((0, PARAMETERS))
         self.spread[:] = 0.0
 
@@ -110,16 +111,16 @@ class DiscPrior:
         *,
         spread: bool,
     ) -> Float | None:
-        """Fit the discs to a frame, and return the load variances (2, Q), pitch².
+        """Fit the discs to a frame, and return the load variances (2, Q), in pitch².
 
         The estimator's factors are overwritten.
 
         Args:
             observation: The frame.
             members: Wires whose equations are used.
-            untouched2: s² of the loads on untouched skin, pitch².
-            uniform2: s² of equal loads over the whole patch, pitch².
-            spread: Whether to compute :attr:`spread` too.
+            untouched2: s² of the loads on untouched skin, in pitch².
+            uniform2: s² of equal loads over the whole patch, in pitch².
+            spread: Whether to compute :attr:`spread` as well.
 
         Returns:
             The variances; None if the loads are not local.
@@ -158,7 +159,7 @@ class DiscPrior:
 
 
 class _Search:
-    """Search for the discs of one frame, with the current whitened data of the estimator."""
+    """Search for the discs of one frame, using the estimator's current whitened data."""
 
     def __init__(self, prior: DiscPrior, data: Float) -> None:
         self._p, self._data = prior, data
@@ -178,7 +179,7 @@ class _Search:
         return self._climb(discs, 0)
 
     def place_of_next(self, discs: Float) -> Float | None:
-        """Return the cell (2,) where a further disc may be needed; None if no disc is needed."""
+        """Return the cell (2,) where another disc may be needed; None if no disc is needed."""
         if len(discs) == MOST:
             return None
         left = self._match
@@ -193,7 +194,7 @@ class _Search:
         return np.asarray(self._p._place[best])
 
     def with_disc_at(self, place: Float, discs: Float) -> tuple[Float, float]:
-        """Return ``discs`` with a further disc near ``place``, and the resulting gain in evidence."""
+        """Return ``discs`` with another disc near ``place``, and the resulting gain in evidence."""
         p, before = self._p, self.evidence
         self._include(place[None])
         if not len(discs):
@@ -242,7 +243,7 @@ class _Search:
         )
 
     def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
-        """Add the variance due to a disc that may exist although it was rejected."""
+        """Add the variance due to a rejected disc that may nevertheless exist."""
         p, effects = self._p, self._effects
         own, other = np.empty((2, effects.match.size))
         kernels.mean_loads(discs, effects, p._scratch, own)

@@ -33,15 +33,15 @@ from skinnode.solve.linalg.cholesky import cholesky, solve_lower_transposed_vect
 from skinnode.solve.linalg.vectors import Index
 
 SOFT: Final = 0.25
-"""Rim width of a disc, cells."""
+"""Rim width of a disc, in cells."""
 FAINT: Final = 0.03
 """Load variance of a cell, relative to the largest, below which the cell is neglected in the evidence."""
 RADIUS: Final = 1.5
-"""Expected radius of a disc, cells."""
+"""Expected radius of a disc, in cells."""
 RADIUS_SPREAD: Final = 0.7
 """Standard deviation of ln(R + ¼) in the prior of a disc."""
 RADIUS_RANGE: Final = (0.3, 4.0)
-"""Minimum and maximum radius of a disc, cells."""
+"""Minimum and maximum radius of a disc, in cells."""
 AMPLITUDE_SPREAD: Final = 1.0
 """Standard deviation of ln a in the prior of a disc."""
 LAYER: Final = 0.5
@@ -54,15 +54,15 @@ SWEEPS: Final = 3
 """Maximum number of sweeps over all parameters. After a sweep without an improvement, the steps are
 halved."""
 WORTH: Final = 0.05
-"""Minimum gain in log-likelihood for a step to be taken."""
+"""Minimum gain in log-likelihood for a step to be accepted."""
 PARAMETERS: Final = 5
-"""Number of parameters of a disc: row, column, ln R, ln a, ln β."""
+"""Number of parameters per disc: row, column, ln R, ln a, ln β."""
 LOADS: Final = 4
-"""Number of loads of a cell: shear along and across the wire, normal load, normal load on a layer."""
+"""Number of loads per cell: shear along and across the wire, normal load, normal load on a layer."""
 
 
 class Effects(NamedTuple):
-    """Effects of the loads of n cells on the data of one frame."""
+    """Effects of n cells' loads on the data of one frame."""
 
     place: Float
     """(n, 2) row and column of each cell."""

@@ -2,8 +2,8 @@
 
     python tools/messages.py [FOLDER...]
 
-A message is any string with a space that is not a docstring. In an f-string, braces enclose the expressions
-whose values are inserted.
+A message is any string that contains a space and is not a docstring. In an f-string, braces enclose the
+expressions whose values are inserted.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Current faults of the patches and buses of a simulated hand, and a log of their changes.
 
 Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, the command ``vcan-sim inject`` and the fault
-schedule of a scene. Changes made together are checked first: if one is invalid, none takes effect.
+schedule of a scene. Changes made together are all checked first: if one is invalid, none takes effect.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class FaultEvent:
     on: bool
     """True if the fault starts, False if it ends."""
     refused: str = ""
-    """Reason why a scheduled change was refused; empty if it took effect."""
+    """Reason for refusing a scheduled change; empty if the change took effect."""
 
     def __str__(self) -> str:
         what = f"{self.place}:{name_and_value(self.fault, self.value)} {'on' if self.on else 'off'}"
@@ -50,7 +50,7 @@ class FaultEvent:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Patches and buses of a fleet, by name, and functions that check and set their faults.
+    """Names of a fleet's patches and buses, and functions that check and set their faults.
 
     The ``check`` functions raise ConfigError if a patch or bus cannot have the given faults.
     """
@@ -64,7 +64,7 @@ class Places:
 
 
 class FleetFaults:
-    """Faults of the patches and buses of a fleet. Methods may be called from any thread.
+    """Faults of a fleet's patches and buses. Methods may be called from any thread.
 
     Args:
         places: Patches and buses of the fleet.

@@ -32,7 +32,7 @@ _HIGHEST: Final = highest(0, 0).name
 others."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of similar entries that have one row each; a larger number shares one row."""
+"""Maximum number of similar entries listed in separate rows; more than this share one row."""
 
 
 def cob_ids() -> str:
@@ -100,7 +100,7 @@ def formats() -> str:
 
 
 def example_scan() -> str:
-    """Show the bytes of the frames for a scan of a pressed patch."""
+    """Show the bytes of some frames from a scan of a pressed patch."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -219,7 +219,7 @@ def _shape(item: Object) -> list[tuple[object, ...]]:
 
 
 def _family(item: Object) -> str:
-    """Return an object's name without the number at its end, for example `Codes of upper wire`."""
+    """Return an object's name without its trailing number, for example `Codes of upper wire`."""
     return item.name.rstrip("0123456789")
 
 

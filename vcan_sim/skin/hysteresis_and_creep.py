@@ -11,8 +11,8 @@ creep        d = s + c₁ q₁ + c₂ q₂, where τᵢ dqᵢ/dt = s − qᵢ. T
              1976, section 5.5). The response to a step s is s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
 
 The result is the true displacement of the electrodes. The state advances from time 0 in steps of
-:data:`STEP_S`, within which the output of the hysteresis model is taken as linear. A time between two steps
-is reached by a partial step that is not stored, so results do not depend on the times requested earlier.
+:data:`STEP_S`. Within a step, the output of the hysteresis model is assumed to be linear. A time between two
+steps is reached by a partial step that is not stored, so results do not depend on the times requested earlier.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ class FaultyConverter:
         return read
 
     def _hold(self, read: Float, faults: Faults) -> None:
-        """Hold the resistances of frozen wires and stuck crossings at their values at the start of the fault."""
+        """Hold the resistances of frozen wires and stuck crossings at their values when the fault began."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
         held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (

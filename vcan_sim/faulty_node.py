@@ -324,7 +324,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the data of an outgoing frame, with a false product code or layout hash if a fault is set."""
+        """Return an outgoing frame's data, with a false product code or layout hash if a fault is set."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id

@@ -25,7 +25,7 @@ pair of wires reads inf, and a shorted pair reads 0."""
 
 
 class SkinMotion(Protocol):
-    """Motion of the skin in a :class:`vcan_sim.default_scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
+    """Skin motion from a :class:`vcan_sim.default_scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
 
     @property
     def layout(self) -> PatchLayout:

@@ -1,10 +1,10 @@
 """Skin of one patch in a scene, interpolated between the time steps of the touches.
 
 The state at a given time is the weighted mean of the four nearest time steps, with the weights of a uniform
-cubic B-spline (de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are nonnegative and sum to 1,
-so the mean is physically consistent: pressure is nonnegative, shear traction stays within the friction limit,
-and the displacement is the response of the layer to the tractions. All quantities are twice continuously
-differentiable in time. Motions shorter than four time steps are smoothed.
+cubic B-spline (de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are nonnegative and sum
+to 1, so the mean is physically consistent: pressure is nonnegative, shear traction stays within the friction
+limit, and the displacement is the response of the layer to the tractions. All quantities are twice
+continuously differentiable in time. Motions shorter than four time steps are smoothed.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ MARGIN: Final = 0.1
 """Margin of the window around the deepest contact, relative to the contact's half width. The minimum is
 ``MARGIN_CELLS`` cells."""
 FRICTION_MARGIN: Final = 0.15
-"""Additional margin per unit of the friction coefficient, because a sliding body piles up skin ahead of it."""
+"""Additional margin per unit of the friction coefficient. A sliding body piles up the skin ahead of it."""
 MARGIN_CELLS: Final = 2
 CLOSE: Final = 3e-4
 """Tolerance of the contact solver (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
@@ -166,7 +166,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # the remaining difference is within the error of the contact solver
+        if high - low < 0.1 * close * high:  # the rest is within the error of the contact solver
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:

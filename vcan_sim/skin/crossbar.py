@@ -55,7 +55,7 @@ class Side:
         return not self.feed_ohm.any()
 
     def first(self) -> Float:
-        """Return the incidence matrix (W · nodes, W), with 1 at the first node of each wire and 0 elsewhere."""
+        """Return the incidence matrix (W · nodes, W): 1 at the first node of each wire, 0 elsewhere."""
         wires = len(self.series_ohm)
         found = np.zeros((wires * self.nodes, wires))
         found[np.arange(wires) * self.nodes, np.arange(wires)] = 1.0

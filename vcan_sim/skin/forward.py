@@ -1,8 +1,8 @@
 """Conductances between the electrodes of a patch.
 
-An exact patch has point electrodes. The path between two electrodes at distance d has the conductance 1 / (ρ d),
-which has the form of the potential of a point charge. :class:`ExactForward` sums these conductances directly.
-:class:`Paths` adds two effects:
+An exact patch has point electrodes. The path between two electrodes at distance d has the conductance
+1 / (ρ d), which has the form of the potential of a point charge. :class:`ExactForward` sums these
+conductances directly. :class:`Paths` adds two effects:
 
 finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
                     where l₁ and l₂ are the distances to the nearest and farthest points of its rim

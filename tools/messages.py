@@ -1,4 +1,4 @@
-"""Print all messages of the programs, one per line, for review::
+"""Print all messages in the programs, one per line, for review::
 
     python tools/messages.py [FOLDER...]
 

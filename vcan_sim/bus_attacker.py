@@ -36,7 +36,7 @@ _RETRY_S: Final = 0.05
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Maximum SYNC counter of the second master."""
+"""Maximum value of the second master's SYNC counter."""
 
 
 @dataclass(frozen=True, slots=True)

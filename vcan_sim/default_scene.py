@@ -2,7 +2,7 @@
 
 The ground truth is free of discretisation error: the displacement of the electrodes is the closed-form
 solution for a sliding Hertz contact on a half-space (:class:`skinnode.model.elastic.HertzContact`). A scene
-is a pure function of scene time and seed, so its state can be computed at any time, in any order.
+is a pure function of scene time and seed, so its states can be computed for any times, in any order.
 
 The onset of sliding is simplified. While the sphere accelerates, the ratio of shear stress to pressure rises
 from zero to the coefficient of friction, uniformly across the contact. In a real contact, slip starts at the
@@ -27,14 +27,15 @@ LEAD_S: Final = 0.8
 """Minimum time before the first press, s. The baseline is measured on the untouched skin during this time."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Durations of pressing, sliding and lifting, as fractions of a cycle. Otherwise, the skin is untouched."""
+"""Durations of pressing, sliding and lifting, as fractions of a cycle. For the rest of the cycle, the skin is
+untouched."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is the slide's unit vector."""
+    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is the unit vector of the slide."""
 
     radius_m: float
     depth_m: float

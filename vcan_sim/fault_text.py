@@ -48,7 +48,7 @@ class FaultChange:
         """Return ``faults`` with this change applied.
 
         Raises:
-            ConfigError: If a value is out of range, or two values are inconsistent.
+            ConfigError: If a value is out of range, or if two values are inconsistent.
         """
         kept = type(faults)(seed=faults.seed) if self.clears else faults  # the seed is not a fault
         return dataclasses.replace(kept, **self.values)  # type: ignore[arg-type]  # types match

@@ -86,7 +86,7 @@ class Faults:
     miscounted: float = 0.0
     """Fraction of chunks with a wrong scan counter."""
     miscounted_by: int | None = None
-    """Error of the scan counter in ``miscounted`` chunks, modulo 256; None for a random error."""
+    """Error in the scan counter of ``miscounted`` chunks, modulo 256; None for a random error."""
     corrupted: float = 0.0
     """Fraction of chunks in which one code is wrong. The length and the counters are correct."""
 

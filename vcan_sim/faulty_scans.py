@@ -59,7 +59,7 @@ class FaultyScans:
         self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
         self._intact = False  # whether no fault, of this scan or an earlier one, affects this scan
-        self._counter_instead: int | None = None  # counter of the torn scan before this scan
+        self._counter_instead: int | None = None  # counter of a torn scan, sent again in this scan
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
         self._struck = -1  # index of the chunk affected by the scan fault

@@ -59,9 +59,9 @@ class Fleet:
     closes the buses. A ``with`` block calls both.
 
     Args:
-        hand: Hand configuration, with its ``[simulation]`` settings.
-        interface: python-can interface to use instead of the one in the hand file.
-        channel: Channel to use instead of the one in the hand file.
+        hand: Hand configuration, including its ``[simulation]`` settings.
+        interface: python-can interface; default: the interface in the hand file.
+        channel: Channel of the bus; default: the channel in the hand file.
         faults: Initial faults of every node. :meth:`inject` replaces them.
         wire_up: Function that returns the resistance source for the converter of a simulated patch; default:
             the patch itself.
@@ -72,9 +72,9 @@ class Fleet:
             once, as soon as any node has sent its first scan.
 
     Raises:
-        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` name an unknown
-            patch, or reduce the gap between two electrodes too much; or if the scene contains a touch or a
-            fault that is impossible on its patch or bus.
+        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` names an
+            unknown patch or reduces the gap between two electrodes too much; or if the scene contains a touch
+            or a fault that is impossible on its patch or bus.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of which are rarely used

@@ -32,7 +32,7 @@ class FaultEvent:
     """Log entry for the start or end of a fault."""
 
     time_ns: int
-    """Time of the event since 1970, ns."""
+    """Time of the event, in nanoseconds since 1970."""
     place: str
     """Name of the faulty patch or bus."""
     fault: str
@@ -82,7 +82,7 @@ class FleetFaults:
         self._log: list[FaultEvent] = []
         self.set_patches(dict.fromkeys(places.patches, initial))
 
-    # --- what is injected
+    # --- current faults
 
     def patch(self, name: str) -> Faults:
         """Return the current faults of a patch."""
@@ -109,7 +109,7 @@ class FleetFaults:
     # --- changes
 
     def inject(self, *texts: str, key: str = "--fault") -> None:
-        """Change the named faults. All others remain unchanged.
+        """Change the named faults. All other faults remain unchanged.
 
         Args:
             *texts: Strings such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
@@ -176,7 +176,7 @@ class FleetFaults:
                     for name, value in values.items()
                 ]
 
-    # --- inside
+    # --- internal
 
     def _change(self, changes: Iterable[FaultChange]) -> None:
         with self._lock:

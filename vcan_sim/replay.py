@@ -123,5 +123,5 @@ def _drain(port: CanPort) -> None:
     try:
         while port.recv(0.0) is not None:
             pass
-    except BusError:  # sending will report it
+    except BusError:  # the next send reports the error
         return

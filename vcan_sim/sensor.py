@@ -1,4 +1,4 @@
-"""Simulated resistance readings of a patch, for the converter of a node."""
+"""Simulated resistance readings of a patch, for a node's converter."""
 
 from __future__ import annotations
 
@@ -154,8 +154,8 @@ class SimulatedPatch:
         """Return the true displacement of the electrodes during a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: :meth:`truth_m` minus the actual positions at rest. This is what solvers
-            estimate, because they compare readings with a baseline.
+            (U, N, 3) float64, m: :meth:`truth_m` minus the actual positions at rest. Solvers estimate
+            this displacement, because they compare readings with a baseline.
         """
         return np.asarray(self.truth_m(t_ns) - self.skin.rest_m)
 

@@ -221,7 +221,7 @@ def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
     found = cast(Segment, clock.shared[name])
     if found.rates != rates:
         raise can.CanInitializationError(
-            f"{channel}: got {rates}, must be {found.rates} as at the first call"
+            f"{channel}: got {rates}, must be {found.rates} as in the first call"
         )
     return found
 

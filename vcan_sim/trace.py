@@ -53,8 +53,8 @@ class Listener:
 
     Args:
         bus: Bus to record.
-        write: Function called with each line of the trace, in the thread of the listener; by default, lines
-            are kept for :meth:`text`.
+        write: Function called with each line of the trace, in the listener's thread; by default, lines are
+            kept for :meth:`text`.
         channel: Name of the channel in the trace; default: the channel of the bus.
 
     Raises:

@@ -108,7 +108,7 @@ class VirtualClock:
 
     @property
     def now_ns(self) -> int:
-        """Monotonic virtual time, ns. Unlike a call of :meth:`monotonic_ns`, it is not a clock reading."""
+        """Monotonic virtual time, ns. Unlike :meth:`monotonic_ns`, it does not count as a clock reading."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
@@ -124,7 +124,7 @@ class VirtualClock:
         return self._now_ns
 
     def made_progress(self) -> None:
-        """Reset the clock readings of the current thread to zero.
+        """Reset the current thread's count of clock readings to zero.
 
         A thread that takes items from a queue is not polling: it waits when the queue is empty.
         """
@@ -199,7 +199,7 @@ class VirtualClock:
         try:
             self._pass_on(turn)
         except BaseException:
-            if turn.woken:  # this thread will not handle the wake-up
+            if turn.woken:  # wake another thread instead
                 self.wake(waiting)
             raise
         return turn.woken

@@ -1,6 +1,6 @@
 """Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
-The mutation operators are those of cosmic-ray. Places in the source are drawn with equal probability, and
+The mutation operators come from cosmic-ray. Places in the source are drawn with equal probability, and
 then one mutation is drawn for each place. If mutations were drawn directly, a ``+``, which has eleven
 mutations, would be drawn eleven times as often as a ``not``, which has one.
 

@@ -140,7 +140,7 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
     """Return the surface displacement under a uniform unit traction on a square cell at the origin.
 
     The displacement of a half-space has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
-    generalisation of Johnson, eq. 3.25, to all directions). It combines the integrals of 1/R, x²/R³, y²/R³,
+    a generalisation of Johnson, eq. 3.25, to all directions). It combines the integrals of 1/R, x²/R³, y²/R³,
     xy/R³, x/R² and y/R² over the cell. The difference between the layer and a half-space is smooth and is
     integrated by Gauss-Legendre quadrature.
 

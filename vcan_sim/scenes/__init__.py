@@ -1,4 +1,4 @@
-"""Scenes from files: rigid bodies press on the patches of a hand, and slide, roll or turn in contact.
+"""Scenes from files: rigid bodies press on the patches of a hand, and slide, roll or turn on the skin.
 
 ::
 

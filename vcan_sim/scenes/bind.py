@@ -57,7 +57,7 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
 def layer_of(skin: SkinConfig, patch: PatchConfig, layout: PatchLayout) -> Layer:
     """Return the elastic layer of a patch.
 
-    Values of the scene file override those of the hand file.
+    Values in the scene file override those in the hand file.
 
     Args:
         skin: The scene file's ``[skin]`` table.

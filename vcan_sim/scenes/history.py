@@ -73,9 +73,9 @@ class History:
     ) -> None:
         self.touch, self.window, self.step_s = touch, window, step_s
         self.first = math.floor(touch.from_s / step_s)
-        """Number of the first time step. There is no contact earlier."""
+        """Number of the first time step. There is no contact before this step."""
         self.last = math.ceil(touch.to_s / step_s)
-        """Number of the last time step. There is no contact later."""
+        """Number of the last time step. There is no contact after this step."""
         self._shape, self._friction, self._electrodes = shape, friction, electrodes
         self._steps: list[Step | None] = []
         self._contact = untouched(window.grid)
@@ -191,8 +191,8 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
 ) -> Contact:
     """Return the contact after the body has moved.
 
-    If the solver does not converge, the tolerance is increased by the factors in ``_LOOSER``. If none of the
-    tolerances is large enough, the time step is computed without friction.
+    If the solver does not converge, it runs again with the next factor in ``_LOOSER``. If no factor is large
+    enough, the time step is computed without friction.
 
     Raises:
         NoSolution: If the solver does not converge even without friction.

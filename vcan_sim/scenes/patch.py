@@ -85,7 +85,7 @@ class PatchScene:
         """Compute the time steps of all touches in advance, rather than on demand.
 
         Args:
-            until_s: End of the computed part of the scene, s.
+            until_s: Scene time up to which the time steps are computed, s.
         """
         for history in self.histories:
             if history.touch.from_s < until_s:
@@ -106,7 +106,7 @@ class PatchScene:
 
 
 def _spline(share: float) -> tuple[float, float, float, float]:
-    """Return the cubic B-spline weights of four time steps, at ``share`` between the second and third."""
+    """Return cubic B-spline weights of four time steps; ``share`` is the fraction from second to third."""
     s, rest = share, 1.0 - share
     cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
     second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)

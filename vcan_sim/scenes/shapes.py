@@ -22,7 +22,7 @@ class Shape:
     """Shape of a rigid body.
 
     Attributes:
-        height: Function from positions (…, 2) in the body frame to heights (…,) above the lowest point,
+        height: Function that maps positions (…, 2) in the body frame to heights (…,) above the lowest point,
             metres.
         round: Whether the height depends only on the horizontal distance from the lowest point.
         key: Values that determine the height. Shapes with equal keys are equal.

@@ -148,7 +148,7 @@ class MotionConfig(Table):
     to_s: _Time
     """Scene time at which the motion ends, s."""
     by_m: _Place | None = None
-    """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its start."""
+    """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its starting point."""
     by_rad: _Angle | None = None
     """Angle of rotation for ``turn``, rad, counterclockwise as seen from above the skin."""
     depth_m: Length | None = None
@@ -286,7 +286,7 @@ class FaultConfig(Table):
     from_s: _Time = 0.0
     """Scene time at which the faults start, s."""
     to_s: _Time | None = None
-    """Scene time at which the faults end, s; default: the end or repetition of the scene."""
+    """Scene time at which the faults end, s; default: when the scene ends or repeats."""
 
     @model_validator(mode="after")
     def _end_after_start(self) -> FaultConfig:
@@ -432,7 +432,7 @@ def parse_scene(table: Mapping[str, Any], *, where: str = "") -> SceneConfig:
     """Create a scene from a table with the keys of a scene file.
 
     Args:
-        table: Scene in the form that tomllib returns.
+        table: Scene in the form returned by tomllib.
         where: File name for error messages.
 
     Raises:

@@ -147,7 +147,8 @@ def solve_depth(
     The power law fails if few cells are in contact, so every second step bisects the bracket.
 
     Args:
-        force_n: Function from depth (m) to force (N). The last call uses the returned depth.
+        force_n: Function that returns the force (N) at a given depth (m). Its last call is made at the
+            returned depth.
         target_n: Target force, N, positive.
         known: Known depth (m) and force (N). The first trial depth is derived from them, assuming F ∝ δ^1.5.
         close: Tolerance on the force, relative to the target.

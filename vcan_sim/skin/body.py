@@ -40,7 +40,7 @@ class Draws:
         self._seed, self._number = seed, number
 
     def stream(self, name: str, *more: int) -> np.random.Generator:
-        """Return the random generator for an imperfection; each ``more`` gives an independent generator."""
+        """Return the random generator for an imperfection; each value of ``more`` has its own generator."""
         return np.random.default_rng([self._seed, self._number, *name.encode(), *more])
 
     def normal(self, name: str, *shape: int) -> Float:

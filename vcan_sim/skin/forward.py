@@ -94,7 +94,7 @@ class Paths:
         return _borrowed((3, upper_m.size // 3, self._lower.shape[1]))
 
     def _each(self, upper_m: Float, work: Float) -> Float:
-        """Return the conductances (U N, K M) of all paths in 1/m, in one of the arrays in ``work``."""
+        """Return the conductances (U N, K M) of all paths in 1/m, stored in ``work``."""
         plane, square = self._squares(upper_m, work)
         found: Float = work[2]
         with np.errstate(divide="ignore"):
@@ -110,7 +110,7 @@ class Paths:
         return found
 
     def _squares(self, upper_m: Float, work: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in the plane and in space, in m², in arrays in ``work``."""
+        """Return the squared distances (U N, K M) in the plane and in space, in m², stored in ``work``."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
         plane, square, gap = work
         for axis, out in ((0, plane), (1, gap), (2, square)):

@@ -35,7 +35,7 @@ THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 _RECENT: Final = 128
 """Number of recent time steps whose states are stored."""
 _KEPT_EVERY: Final = 64
-"""Number of time steps (2 s) between states that are stored longer."""
+"""Number of time steps (2 s) between states that are stored for longer."""
 _KEPT: Final = 300
 """Number of states stored at intervals of ``_KEPT_EVERY`` steps (ten minutes). Only every ``_THINNED``-th
 older state is kept."""

@@ -1,4 +1,4 @@
-"""Sizes of the imperfections of a simulated patch."""
+"""Sizes of a simulated patch's imperfections."""
 
 from __future__ import annotations
 

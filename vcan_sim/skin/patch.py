@@ -32,9 +32,9 @@ class PhysicalPatch:
     only on time, not on earlier calls. Without imperfections, the resistances equal those of
     :class:`ExactForward` bit for bit.
 
-    The read-outs ``grounded`` and ``floating`` are simplified: the paths of each upper wire have their
-    conductances at the sampling time of that wire, even while another upper wire is sampled. Only sneak
-    currents are affected.
+    The read-outs ``grounded`` and ``floating`` are simplified: the conductances of each upper wire's paths
+    are taken at the sampling time of that wire, even while another upper wire is sampled. This affects only
+    sneak currents.
 
     Args:
         layout: Nominal layout of the patch, as in the hand file.

@@ -21,7 +21,7 @@ class BitRates:
 
     Time is counted in ticks. A nanosecond, a nominal bit time and a data bit time are all whole multiples of
     a tick, which is the longest unit with this property; it is 1 ns if both bit times are whole nanoseconds.
-    Times in ticks are exact. Only the times reported to callers are rounded, each one separately, so rounding
+    Times in ticks are exact. Only the times reported to callers are rounded, each separately, so rounding
     errors do not accumulate.
 
     Raises:

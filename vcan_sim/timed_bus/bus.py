@@ -235,7 +235,7 @@ class TimedBus:
     def next_event_ns(self) -> int | None:
         """Time (ns) at which to call :meth:`advance` next; None if nothing is pending.
 
-        That call can return no events, because some steps of the bus are internal.
+        That call may return an empty list, because some steps of the bus are internal.
         """
         if self._events:
             return self._rates.ceil_ns(self._now)

@@ -47,7 +47,7 @@ class ErrorFrame(NamedTuple):
     frames: tuple[CanFrame, ...]
     """Frame on the bus, or the colliding frames in the order of ``stations``."""
     bit: int
-    """Position of the bit in which the error was detected; the start of frame is 0."""
+    """Position of the bit in which the error was detected; the start of frame is bit 0."""
     cause: Cause
     detected_by: tuple[int, ...]
     """Stations that detected the error in this bit. The other stations detect the error flag."""

@@ -76,7 +76,7 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
         return WireFrame((*stuffed, *tail), n, n - len(places), (), n, range(0))
 
     stuffed, places = _stuffed((*head, *payload))
-    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit replaces it
+    if places[-1:] == [len(stuffed) - 1]:  # replaced by the first fixed stuff bit
         del stuffed[-1], places[-1]
     count = len(places) % 8
     gray = count ^ count >> 1
@@ -99,7 +99,7 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
 
 
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
-    """Return the number of bits of an error flag after which a receiver detects an error.
+    """Return the number of error flag bits after which a receiver detects an error.
 
     The flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or the form
     of the delimiters and the end of frame. If it violates none of these rules, it corrupts the CRC, and a

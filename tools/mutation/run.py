@@ -105,8 +105,8 @@ class Tree:
     def put(self, mutant: Mutant) -> None:
         """Apply a mutant to the copy, and remove the compiled kernels that it affects.
 
-        numba recompiles the kernels of a file that has changed, but not the kernels of other files that depend
-        on it, so this method removes the latter.
+        numba recompiles the kernels of a file that has changed, but not the kernels of other files that
+        depend on it, so this method removes the latter.
         """
         path = self.source / mutant.file
         found = path.stat()

@@ -1,9 +1,9 @@
-"""Print all messages of the programs, one per line, for review::
+"""Print all messages in the programs, one per line, for review::
 
     python tools/messages.py [FOLDER...]
 
-A message is any string with a space that is not a docstring. In an f-string, braces enclose the expressions
-whose values are inserted.
+A message is any string that contains a space and is not a docstring. In an f-string, braces enclose the
+expressions whose values are inserted.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 All solvers are given the same functions, a tolerance of 1e-12 and at most 2000 evaluations. The solvers start
 from the standard starting points multiplied by 1, 10 and 100. A square system with a root counts as solved if
-the final point is a root, any other system if it is a minimum of the residual norm. Roots and minima are
-verified in 80-bit arithmetic, whatever status the solver reports.
+the final point is a root; any other system, if the final point is a minimum of the residual norm. Roots and
+minima are verified in 80-bit arithmetic, regardless of the status that the solver reports.
 
 A solver makes a false claim if it reports success at a point that is neither a root nor a minimum, or if it
 reports a root of a square system at a point that is only a minimum.
@@ -108,7 +108,7 @@ def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Return a solver's row of the table; ``tall`` is None if the solver does not support tall systems."""
+    """Return a solver's table row; ``tall`` is None if the solver does not support tall systems."""
     kinds = {"square": True, "tall": False}
     found = {
         kind: None if "hybr" in name and not square else list(outcomes(SOLVERS[name], square))

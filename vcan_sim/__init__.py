@@ -1,4 +1,4 @@
-"""Simulator of a hand: its patches, touched by simulated bodies, run as CANopen nodes.
+"""Simulator of a hand whose patches are touched by simulated bodies and run as CANopen nodes.
 
 ::
 

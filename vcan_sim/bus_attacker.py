@@ -1,4 +1,4 @@
-"""Faults of a CAN bus, and the rogue device that causes some of them.
+"""Faults on a CAN bus, and the rogue device that causes some of them.
 
 The rogue device has its own endpoint on the bus. Its frames take part in arbitration, and all nodes and hosts
 receive them.
@@ -26,9 +26,9 @@ FLOOD_COB_ID: Final = 0x001
 FLOOD_DATA: Final = bytes([0x55] * 8)
 _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
-"""Minimum interval between two batches of rogue frames, ns."""
+"""Minimum interval between batches of rogue frames, ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""Time by which flood frames are queued in advance, ns. This prevents gaps on a fully starved bus."""
+"""How far ahead flood frames are queued, ns. This prevents gaps on a fully starved bus."""
 _MOST_AT_ONCE: Final = 256
 """Maximum number of overdue rogue frames of one kind in a batch. The rest are dropped."""
 _RETRY_S: Final = 0.05
@@ -36,26 +36,26 @@ _RETRY_S: Final = 0.05
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Maximum SYNC counter of the second master."""
+"""Maximum value of the second master's SYNC counter."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus; none by default.
+    """Faults on one bus; none by default.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
     """
 
     seed: int = 1
-    """Random seed of the faults."""
+    """Random seed for the faults."""
     bus_off: bool = False
-    """Whether the nodes' CAN controller is bus-off: the nodes neither send nor receive frames."""
+    """Whether the nodes' CAN controller is bus-off, so that the nodes neither send nor receive frames."""
     starved: float = 0.0
-    """Fraction of the bus capacity taken up by a rogue device, whose frames have COB-ID 0x001, the highest
+    """Fraction of the bus capacity used by a rogue device, which sends frames with COB-ID 0x001, the highest
     priority after NMT."""
     rogue_nmt_per_s: float = 0.0
-    """Rate of random NMT commands from a second master, each to one node or to all nodes, 1/s."""
+    """Rate of random NMT commands from a second master, 1/s. Each is sent to one node or to all nodes."""
     rogue_sync_per_s: float = 0.0
     """Rate of SYNC messages from a second master, 1/s."""
     disturbed: float = 0.0
@@ -111,7 +111,7 @@ def check_bus(faults: BusFaults, bus: BusConfig) -> None:
 
 
 class BusAttacker:
-    """Rogue device on a bus. Its thread starts with the first fault that requires it.
+    """Rogue device on a bus. Its thread starts when a fault first requires the device.
 
     Args:
         bus: Configuration of the bus.
@@ -130,7 +130,7 @@ class BusAttacker:
         self._syncs = 0
 
     def set(self, faults: BusFaults) -> None:
-        """Replace the faults, and start the thread if they require it for the first time."""
+        """Replace the faults, and start the thread when it is first needed."""
         self._faults = faults
         self._changed.set()
         if faults.needs_attacker and self._thread.ident is None:
@@ -193,7 +193,7 @@ class BusAttacker:
         period_ns: float,
         until_ns: float,
     ) -> float:
-        """Send the due rogue frames of one kind, and return the time (ns) at which the next is due."""
+        """Send the rogue frames of one kind that are due, and return the time (ns) when the next is due."""
         make: Callable[[random.Random], tuple[int, bytes]] = getattr(self, f"_{name}")
         for _ in range(_MOST_AT_ONCE):
             if due_ns > until_ns:

@@ -12,7 +12,7 @@ from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run ``vcan-sim`` with the arguments ``argv``; default: those of the process."""
+    """Run ``vcan-sim`` with ``argv``; default: the arguments of the process."""
     main_of("vcan_sim.commands._app", argv)
 
 

@@ -1,4 +1,4 @@
-"""Control of a running simulator from another process, through JSON messages on a Unix socket.
+"""Controls a running simulator from another process, using JSON messages on a Unix socket.
 
 Each simulator listens on its own socket, ``PID.sock``, in a folder that only the user can access. A request
 and its response are one line each::
@@ -60,7 +60,7 @@ class Answer:
     """Counts of the faults injected so far, by patch and bus."""
 
     def lines(self) -> list[str]:
-        """Return one line of text per patch and bus: current faults, and counts of injected faults."""
+        """Return one line of text per patch and bus, with its current faults and counts."""
         now = dict(text.rpartition(":")[::2] for text in self.now)
         return [
             f"{place}: {now.get(place, 'none')} now; {_listed(counts)} so far"
@@ -73,7 +73,7 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def control_folder() -> Path:
-    """Return the folder of the control sockets, creating it for this user alone if necessary.
+    """Return the folder for control sockets; create it if necessary, accessible only to this user.
 
     Raises:
         ControlError: If the folder cannot be created, or other users can access it.
@@ -165,10 +165,10 @@ def running_simulator(wanted: str | None = None) -> Path:
     """Return the control socket of a running simulator.
 
     Args:
-        wanted: Process-ID of the simulator or name of its hand; None for the only running simulator.
+        wanted: Process ID of the simulator, or name of its hand; None for the only running simulator.
 
     Raises:
-        ControlError: If no simulator is running, or ``wanted`` matches none or several.
+        ControlError: If no simulator is running, or if ``wanted`` matches none or more than one.
     """
     found = dict(_running())
     if not found:

@@ -2,7 +2,7 @@
 
 The ground truth is free of discretisation error: the displacement of the electrodes is the closed-form
 solution for a sliding Hertz contact on a half-space (:class:`skinnode.model.elastic.HertzContact`). A scene
-is a pure function of scene time and seed, so its state can be computed at any time, in any order.
+is a pure function of scene time and seed, so its states can be computed for any times, in any order.
 
 The onset of sliding is simplified. While the sphere accelerates, the ratio of shear stress to pressure rises
 from zero to the coefficient of friction, uniformly across the contact. In a real contact, slip starts at the
@@ -24,17 +24,18 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Minimum time before the first press, s. The baseline is measured on the untouched skin in this time."""
+"""Minimum time before the first press, s. The baseline is measured on the untouched skin during this time."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Durations of press, slide and lift, as fractions of a cycle. The skin is untouched for the rest."""
+"""Durations of pressing, sliding and lifting, as fractions of a cycle. For the rest of the cycle, the skin is
+untouched."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is the slide's unit vector."""
+    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is the unit vector of the slide."""
 
     radius_m: float
     depth_m: float
@@ -47,7 +48,7 @@ class Stroke:
     lift_s: float
 
     def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
-        """Return the contact ``t_s`` seconds into the stroke; None without contact."""
+        """Return the contact ``t_s`` seconds into the stroke; None if there is no contact."""
         lifting = t_s - self.press_s - self.slide_s
         depth = self.depth_m * ease(t_s / self.press_s) * (1.0 - ease(lifting / self.lift_s))
         if depth <= 0.0:
@@ -122,7 +123,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the upper electrodes at scene time ``t_s``, m.
+        """Return the positions (U, N, 3) of the upper electrodes at scene time ``t_s``, in metres.
 
         At rest, the result is ``layout.upper_m`` itself.
         """
@@ -138,10 +139,10 @@ class Scene:
 
     @functools.cached_property
     def _field_m(self) -> tuple[Float, Float]:
-        """Lower and upper corner of the rectangle in which the centre of the sphere moves.
+        """Lower and upper corners of the rectangle within which the centre of the sphere moves.
 
-        The rectangle lies one pitch inside the outermost electrodes on each side. On a patch too small for
-        that, it shrinks to the middle of the patch.
+        The rectangle lies one pitch inside the outermost electrodes on each side. If the patch is too narrow
+        for that, the rectangle shrinks to the centre line or centre of the patch.
         """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))

@@ -15,10 +15,10 @@ Ts = TypeVarTuple("Ts")
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine like :func:`asyncio.run`, in real or virtual time according to the clock of the thread.
+    """Run a coroutine like :func:`asyncio.run`, in real or virtual time, depending on the thread's clock.
 
-    In virtual time, the event loop waits only for timers and callbacks from other threads. It polls sockets
-    and pipes in each iteration, without waiting for them.
+    In virtual time, the event loop waits only for timers and for callbacks from other threads. In each
+    iteration, it polls sockets and pipes without waiting for them.
 
     Args:
         main: Coroutine to run.

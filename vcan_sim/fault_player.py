@@ -1,4 +1,4 @@
-"""Thread that starts and ends the faults of a scene on schedule."""
+"""Thread that starts and ends a scene's faults on schedule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vcan_sim.fleet_faults import FleetFaults
 
 
 class FaultPlayer:
-    """Thread that applies the fault schedule of a scene to a fleet.
+    """Thread that applies a scene's fault schedule to a fleet.
 
     Args:
         schedule: Faults of the scene and their times.

@@ -5,8 +5,8 @@
     text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; default: all patches or all buses
     FAULT    NAME | NAME=VALUE | none    none ends all faults of the patch or bus
 
-The option ``--fault``, the command ``vcan-sim inject`` and the ``[[faults]]`` tables of scene files share
-this form.
+The option ``--fault``, the command ``vcan-sim inject`` and the ``[[faults]]`` tables of scene files use this
+form.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ Value = int | float | bool | None
 AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)
 
 OF_PATCHES: Final = {each.name: each.default for each in dataclasses.fields(Faults)}
-"""Default value of each fault of a patch, by name."""
+"""Default value of each patch fault, by name."""
 OF_BUSES: Final = {each.name: each.default for each in dataclasses.fields(BusFaults)}
-"""Default value of each fault of a bus, by name."""
+"""Default value of each bus fault, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class FaultChange:
         """Return ``faults`` with this change applied.
 
         Raises:
-            ConfigError: If a value is out of range, or two values are inconsistent.
+            ConfigError: If a value is out of range, or if two values are inconsistent.
         """
         kept = type(faults)(seed=faults.seed) if self.clears else faults  # the seed is not a fault
         return dataclasses.replace(kept, **self.values)  # type: ignore[arg-type]  # types match
@@ -88,7 +88,7 @@ def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, 
 
     Args:
         text: One or more faults, separated by commas.
-        on_bus: Whether the faults are those of a bus.
+        on_bus: Whether the faults are bus faults.
         key: Name of the command-line option, for error messages.
 
     Raises:
@@ -98,7 +98,7 @@ def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, 
 
 
 def text_of(faults: Faults | BusFaults) -> str:
-    """Return faults in text form, without the seed; ``none`` if there are none."""
+    """Return faults in text form, without the seed; ``none`` if no fault is set."""
     defaults = OF_BUSES if isinstance(faults, BusFaults) else OF_PATCHES
     shown = [
         name_and_value(name, getattr(faults, name))
@@ -134,7 +134,7 @@ def _change(place: str, listed: str, key: str, *, on_bus: bool) -> FaultChange:
 
 
 def _everywhere(listed: str, patches: Sequence[str], buses: Sequence[str], key: str) -> Iterator[FaultChange]:
-    """Yield the changes to every patch and bus to which the named faults apply."""
+    """Yield a change for every patch and bus to which the named faults apply."""
     parts = _parts(listed, key)
     clears = NONE in parts
     values = _values([part for part in parts if part != NONE], OF_PATCHES | OF_BUSES, key)
@@ -177,5 +177,5 @@ def _allowed(kind: type) -> str:
 
 
 def none_of(*, on_bus: bool) -> Faults | BusFaults:
-    """Return the faults of a fault-free bus or patch."""
+    """Return the ``Faults`` of a fault-free patch, or the ``BusFaults`` of a fault-free bus."""
     return NO_BUS_FAULTS if on_bus else NO_FAULTS

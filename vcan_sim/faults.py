@@ -53,7 +53,7 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults whose value is a wire number, with upper and lower wires alternating."""
+"""Faults whose value is a wire number, alternating between upper and lower wires."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
 """Maximum absolute value of each fault that can be negative."""
@@ -64,18 +64,19 @@ class Faults:
     """Faults of one simulated node; none by default.
 
     Raises:
-        ConfigError: If a value is out of range, or the fractions of chunks or of scans add up to more than 1.
+        ConfigError: If a value is out of range, or if the fractions of the chunks or those of the scans add
+            up to more than 1.
     """
 
     seed: int = 1
-    """Random seed. Equal seeds and equal sequences of frames lead to equal faults."""
+    """Random seed. The same seed and the same sequence of frames always lead to the same faults."""
 
     # --- fractions of the chunks
     lost: float = 0.0
     duplicated: float = 0.0
     """Fraction of chunks sent twice."""
     reordered: float = 0.0
-    """Fraction of chunks that trade places with the next frame."""
+    """Fraction of chunks that swap places with the next frame."""
     late: float = 0.0
     """Fraction of chunks held back until the first frame of the next scan has been sent."""
     short: float = 0.0
@@ -85,14 +86,14 @@ class Faults:
     miscounted: float = 0.0
     """Fraction of chunks with a wrong scan counter."""
     miscounted_by: int | None = None
-    """Error of the scan counter in ``miscounted`` chunks, modulo 256; None for a random error."""
+    """Error in the scan counter of ``miscounted`` chunks, modulo 256; None for a random error."""
     corrupted: float = 0.0
     """Fraction of chunks in which one code is wrong. The length and the counters are correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
-    """Fraction of scans that break off: the second half of the chunks and the summary are not sent. The next
-    scan has the same scan counter."""
+    """Fraction of scans that are cut off: the second half of the chunks and the summary are not sent. The
+    next scan has the same scan counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
     """Fraction of scans in which the node is reset after half of the chunks, as if by a watchdog."""
@@ -140,10 +141,10 @@ class Faults:
     frozen: bool = False
     """Whether the converter is frozen: its readings and its conversion count stop changing."""
     uncounted: bool = False
-    """Whether the converter provides no conversion count. A host can then detect a stopped converter
-    only by constant codes."""
+    """Whether the converter provides no conversion count. A host can then detect a stopped converter only
+    from constant codes."""
     unplugged: bool = False
-    """Whether the node is cut off from bus and power. It boots when the fault ends."""
+    """Whether the node is disconnected from the bus and from power. It boots when the fault ends."""
     wrong_identity: bool = False
     """Whether the node reports a wrong product code."""
     wrong_layout: bool = False
@@ -171,12 +172,12 @@ class Faults:
     stuck_lower: int | None = None
     """Lower wire of the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None
-    """Number of an upper wire whose connection is swapped with that of the next upper wire."""
+    """Number of an upper wire whose connection is swapped with the next upper wire's."""
     crossed_lower: int | None = None
-    """Number of a lower wire whose connection is swapped with that of the next lower wire."""
+    """Number of a lower wire whose connection is swapped with the next lower wire's."""
     flipped: float = 0.0
-    """Fraction of readings with one flipped bit in one code. The check is computed with the flipped bit, so
-    the scan passes it."""
+    """Fraction of readings with one flipped bit in one code. The check includes the flipped bit, so the scan
+    passes the check."""
     drift_per_s: float = 0.0
     """Relative drift of all resistances per second, from -1 to 1. The accumulated factor stays between 0.1
     and 10, and the drift disappears when the fault ends."""
@@ -187,7 +188,7 @@ class Faults:
     """Whether the node's CAN controller is error-passive. The node reports this with emergency 0x8120."""
     duplicate_node_id: bool = False
     """Whether a second node on the bus has the same node-ID. The second node boots, responds to all commands
-    and reports a skin at rest. It disappears when the fault ends."""
+    and reports skin at rest. It disappears when the fault ends."""
     restart_every_s: float = 0.0
     """Interval between spontaneous resets of the node, s; 0 for no resets."""
     emcy_per_s: float = 0.0
@@ -288,7 +289,7 @@ class Injected:
     emergencies: int = 0
     babbled: int = 0
     scans_spoilt: int = 0
-    """Number of scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
+    """Number of scans with missing or bad chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
     """Number of data frames sent with the COB-ID of a chunk or summary, including those of second nodes."""
 
@@ -302,7 +303,7 @@ def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
     Args:
         faults: Faults of the patch.
         patch: Name of the patch.
-        shape: Numbers of upper and lower wires of the patch.
+        shape: Number of upper wires and number of lower wires of the patch.
 
     Raises:
         ConfigError: If a wire number is too large for the patch.

@@ -62,7 +62,7 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 
 
 class FaultyBus:
-    """Bus of a simulated hand, including injected faults and their counts.
+    """Bus of a simulated hand; applies injected faults and counts them.
 
     Args:
         config: Configuration of the bus.
@@ -78,7 +78,7 @@ class FaultyBus:
         self._rule: RandomShare | None = None
 
     def connect(self, port: FaultyPort) -> None:
-        """Apply the faults through ``port``, the open port of the nodes."""
+        """Apply the faults through ``port``, the nodes' open port."""
         self._port = port
         self._attacker = BusAttacker(self._config, self._node_ids, self._counts)
         virtual = clock.current()
@@ -90,7 +90,7 @@ class FaultyBus:
         self._apply()
 
     def stop(self) -> None:
-        """End the rogue frames and disturbances, and release the port."""
+        """Stop the rogue frames and disturbances, and release the port."""
         if self._attacker is not None:
             self._attacker.stop()
             self._attacker = None
@@ -125,7 +125,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """From now on, abort the fraction ``share`` of all transmissions with error frames."""
+        """From now on, abort a fraction ``share`` of all transmissions with error frames."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

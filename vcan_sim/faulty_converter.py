@@ -1,4 +1,4 @@
-"""Simulated converter, with faults of its own and of the wires connected to it."""
+"""Simulated converter with injected faults, both its own and those of the wires connected to it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vcan_sim.skin.imperfections import EXACT
 MOST_DRIFT: Final = 10.0
 """Maximum factor by which drift multiplies or divides a resistance."""
 WIRE_NOISE: Final = 3e-3
-"""Noise of a resistance measured through a bad contact: relative standard deviation."""
+"""Relative standard deviation of the noise in a resistance measured through a bad contact."""
 
 
 class FaultyConverter:
@@ -30,7 +30,7 @@ class FaultyConverter:
         source: Source of the resistances that an intact converter would measure.
         injector: The node's faults, random generator and counts.
         booting: Function that returns whether the node is booting.
-        baseline_ohm: Function that returns the baseline R0 (U, K) to which codes refer, ohm.
+        baseline_ohm: Function that returns the baseline R0 in ohms, (U, K), to which codes refer.
         scale: Code scale of the node.
         temperature_per_k: Temperature coefficient of all resistances, 1/K.
     """
@@ -61,7 +61,7 @@ class FaultyConverter:
         return None if self._injector.faults.uncounted else self._conversions
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) at ``t_ns``, ohm. A frozen converter repeats its last reading."""
+        """Return the resistances (U, K) at ``t_ns`` in ohms. A frozen converter repeats its last reading."""
         self._injector.injected.uncounted += self._injector.faults.uncounted
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
@@ -71,7 +71,7 @@ class FaultyConverter:
         return self._reading
 
     def _shifted(self, read: Float, t_ns: int) -> Float:
-        """Apply drift and temperature change to a reading."""
+        """Apply the drift and the temperature change to a reading."""
         faults, injected = self._injector.faults, self._injector.injected
         factor = 1.0
         if faults.drift_per_s:
@@ -115,7 +115,7 @@ class FaultyConverter:
         return read
 
     def _hold(self, read: Float, faults: Faults) -> None:
-        """Replace the resistances of frozen wires and stuck crossings with those from the fault start."""
+        """Hold the resistances of frozen wires and stuck crossings at their values when the fault began."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
         held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (
@@ -130,7 +130,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """Flip one bit of one code of a reading, with probability ``flipped``."""
+        """With probability ``flipped``, flip one bit of one code in a reading."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

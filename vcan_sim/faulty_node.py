@@ -1,7 +1,7 @@
 """Simulated node with injected faults. All frames to and from the node pass through this module.
 
-:mod:`vcan_sim.faulty_converter` implements the faults of readings, and :mod:`vcan_sim.faulty_scans` those of
-scans. All faults other than periodic events are determined by a seed and the sequence of frames.
+:mod:`vcan_sim.faulty_converter` implements the faults in readings, and :mod:`vcan_sim.faulty_scans` the
+faults in scans. All faults other than periodic events are determined by a seed and the sequence of frames.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from vcan_sim.tally import Kind, Tally, kind_of
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
 """Timing tolerances of a simulated node. After a delay on a busy machine, the node sends its overdue chunks
-in one burst instead of skipping the next scan."""
+in a burst instead of skipping the next scan."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """Emergency message: error code 0xFF0F, with the generic and manufacturer-specific bits of the error register
 set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of overdue periodic events of one kind to execute at once. The rest are dropped."""
+"""Maximum number of overdue periodic events of one kind executed at once. The rest are dropped."""
 
 
 TWIN_SERIAL: Final = 0x8000_0000
@@ -55,7 +55,7 @@ class Resting:
         self._ohm = np.where(baseline_ohm > 0.0, baseline_ohm, 1.0)
 
     def read(self, t_ns: int) -> Float:
-        """Return the constant resistances (U, K), ohm."""
+        """Return the constant resistances (U, K) in ohms."""
         return self._ohm
 
 
@@ -74,7 +74,7 @@ class FaultyNode(PatchNode):
         layout: Layout of the patch.
         source: Source of the resistances that the converter reads.
         emit: Function that puts a frame on the bus.
-        on_sent: Function called with the COB-ID of each outgoing frame, whether it was sent or lost.
+        on_sent: Function called with the COB-ID of each outgoing frame, even if the frame is lost.
         serial: Serial number.
         profile: Protocol profile of the node.
         faults: Initial faults. Their seed remains in use when the faults are replaced.
@@ -224,7 +224,7 @@ class FaultyNode(PatchNode):
         return min(due) if own is None else min(own, *due)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Pass the CAN controller state to the node, or error-passive while this fault is active."""
+        """Pass the CAN controller state to the node; pass error-passive while that fault is active."""
         self._controller = state
         passive = self._passive and state is not BusState.OFF
         super().on_bus(BusState.PASSIVE if passive else state, t_ns)
@@ -311,7 +311,7 @@ class FaultyNode(PatchNode):
         self._on_sent(can_id)
 
     def _put_or_lose(self, can_id: int, data: bytes) -> bool:
-        """Send a frame that is not a PDO, unless a fault drops the frame; return whether it was sent."""
+        """Send a non-PDO frame unless a fault drops it, and return whether it was sent."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         if not self._is_cut_off and self._injector.loses(LOST_OUT.get(kind)):
@@ -324,7 +324,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the data of an outgoing frame, with the identity or layout hash falsified if necessary."""
+        """Return an outgoing frame's data, with a false product code or layout hash if a fault is set."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -357,7 +357,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame of the second node on the bus. Its heartbeats also reach this node."""
+        """Put a frame from the second node on the bus. Its heartbeats also reach this node."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:
@@ -373,7 +373,7 @@ class FaultyNode(PatchNode):
 
     @property
     def _is_cut_off(self) -> bool:
-        """Whether the node cannot send, being silent, unplugged or about to be reset."""
+        """Whether the node cannot send because it is silent, unplugged or about to be reset."""
         return self._injector.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 

@@ -1,4 +1,4 @@
-"""Faults of outgoing chunks and summaries."""
+"""Faults in outgoing chunks and summaries."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Put(Protocol):
 
 
 class FaultyScans:
-    """Injector of faults into the chunks and summaries that a node sends.
+    """Injects faults into the chunks and summaries that a node sends.
 
-    A scan suffers either one scan fault, or chunk faults in any number of its chunks. A chunk suffers at most
-    one fault.
+    A scan has either one scan fault, or chunk faults in any number of its chunks. A chunk has at most one
+    fault.
 
     Args:
         injector: The node's faults, random generator and counts.
@@ -49,7 +49,7 @@ class FaultyScans:
         counter_overflow: Callable[[], int],
     ) -> None:
         self.reset_due = False
-        """Whether the node must be reset. It sends nothing until then."""
+        """Whether the node must be reset. It sends nothing until it is reset."""
         self._injector, self._profile = injector, profile
         self._put, self._counter_overflow = put, counter_overflow
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
@@ -58,8 +58,8 @@ class FaultyScans:
         self._half = max(1, profile.n_chunks // 2)
         self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
-        self._intact = False  # whether neither its own fault nor that of an earlier scan affects this scan
-        self._counter_instead: int | None = None  # repeats the counter of a torn scan
+        self._intact = False  # whether no fault, of this scan or an earlier one, affects this scan
+        self._counter_instead: int | None = None  # counter of a torn scan, sent again in this scan
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
         self._struck = -1  # index of the chunk affected by the scan fault
@@ -69,7 +69,7 @@ class FaultyScans:
 
     @property
     def needs_next_scan(self) -> bool:
-        """Whether the fault of this scan extends into the next scan, so the next SYNC must not be lost."""
+        """Whether this scan's fault extends into the next scan, so that the next SYNC must not be lost."""
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
@@ -84,7 +84,7 @@ class FaultyScans:
         if counter != self._counter:
             self._begin_scan(counter)
         self._chunks += 1
-        if self._intact and self._injector.faults is NO_FAULTS:  # fast path, three times as fast
+        if self._intact and self._injector.faults is NO_FAULTS:  # this path is three times as fast
             self._send(self._chunk_id, data)
             return
         changed = self._suffer_scan(data)
@@ -245,8 +245,8 @@ class FaultyScans:
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
         """Send a chunk or summary, then the late chunks of earlier scans.
 
-        Late chunks continue to wait after a ``spoilt`` frame, from which a receiver cannot tell that a new
-        scan has begun. Returns whether the frame itself was sent.
+        A ``spoilt`` frame does not release late chunks, because it does not show a receiver that a new scan
+        has begun. Returns whether the frame itself was sent.
         """
         if not self._put(can_id, data):
             return False

@@ -29,13 +29,13 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Length of the scene whose contact mechanics are computed before the nodes start, s. The rest is computed on
-demand."""
+"""Length of the initial part of the scene for which contact mechanics are computed before the nodes start, s.
+The rest is computed on demand."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """State of one simulated node, and its counters since start-up."""
+    """State of a simulated node, and its counters since start-up."""
 
     patch: str
     node_id: int
@@ -54,27 +54,27 @@ class NodeReport:
 class Fleet:
     """Simulated patches of a hand, each with a CANopen node.
 
-    Nothing touches a patch until its node has sent a scan, so the tare at power-on sees the skin at rest.
+    Nothing touches a patch until its node has sent a scan, so the tare at power-on measures the skin at rest.
     :meth:`start` opens the buses and powers on the nodes. :meth:`stop` sets the nodes to pre-operational and
     closes the buses. A ``with`` block calls both.
 
     Args:
-        hand: Hand configuration, with its ``[simulation]`` settings.
-        interface: python-can interface to use instead of the one in the hand file.
-        channel: Channel to use instead of the one in the hand file.
+        hand: Hand configuration, including its ``[simulation]`` settings.
+        interface: python-can interface; default: the interface in the hand file.
+        channel: Channel of the bus; default: the channel in the hand file.
         faults: Initial faults of every node. :meth:`inject` replaces them.
-        wire_up: Function from a simulated patch to the resistance source of its converter; default: the patch
-            itself.
-        unchecked: Names of the patches that use protocol revision 1.0, without a check in the summary.
+        wire_up: Function that returns the resistance source for the converter of a simulated patch; default:
+            the patch itself.
+        unchecked: Names of the patches that use protocol revision 1.0, which has no check in the summary.
         imperfections: Manufacturing errors, common to all patches or by patch name; default: the
-            imperfections of the scene. The random errors differ from patch to patch.
+            scene's imperfections. The random errors differ from patch to patch.
         scene: Scene to play instead of the random strokes of ``[simulation]``. It starts on all patches at
-            once, when any node has sent its first scan.
+            once, as soon as any node has sent its first scan.
 
     Raises:
-        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` name an unknown
-            patch, or reduce the gap between two electrodes too much; or if the scene contains a touch or a
-            fault that is impossible on its patch or bus.
+        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` names an
+            unknown patch or reduces the gap between two electrodes too much; or if the scene contains a touch
+            or a fault that is impossible on its patch or bus.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of which are rarely used
@@ -149,7 +149,7 @@ class Fleet:
                     each.start(t_ns)
 
     def start(self) -> None:
-        """Compute the beginning of the scene, open the buses and power the nodes on.
+        """Compute the beginning of the scene, open the buses and power on the nodes.
 
         Raises:
             BusError: If a bus cannot be opened. Buses already opened are closed again.
@@ -178,13 +178,13 @@ class Fleet:
 
         If a thread has failed, raises its error.
         """
-        for runner in self._runners:  # at the same time, because each takes up to 0.1 s
+        for runner in self._runners:  # in parallel, because each takes up to 0.1 s
             runner.request_stop()
         self._running.close()
 
     @property
     def failed(self) -> bool:
-        """Whether the thread of any bus has failed. :meth:`stop` then raises the error."""
+        """Whether any bus thread has failed. If so, :meth:`stop` raises its error."""
         return any(runner.failed for runner in self._runners)
 
     @property
@@ -241,11 +241,11 @@ class Fleet:
         }
 
     def tally(self, patch: str) -> Tally:
-        """Return the frame counts of a patch's node, by kind. Updated as the node runs."""
+        """Return the frame counts of a patch's node, by kind; they are updated as the node runs."""
         return self._stations[patch].tally()
 
     def passed(self, bus: str) -> Passed:
-        """Return the counts of frames that the nodes of a bus have sent and received, by kind."""
+        """Return the numbers of frames that the nodes on a bus have sent and received, by kind."""
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:

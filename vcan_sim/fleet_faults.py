@@ -1,7 +1,7 @@
 """Current faults of the patches and buses of a simulated hand, and a log of their changes.
 
 Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, the command ``vcan-sim inject`` and the fault
-schedule of a scene. Changes made together are checked first: if one is invalid, none takes effect.
+schedule of a scene. Changes made together are all checked first: if one is invalid, none takes effect.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class FaultEvent:
     """Log entry for the start or end of a fault."""
 
     time_ns: int
-    """Time of the event since 1970, ns."""
+    """Time of the event, in nanoseconds since 1970."""
     place: str
     """Name of the faulty patch or bus."""
     fault: str
@@ -41,7 +41,7 @@ class FaultEvent:
     on: bool
     """True if the fault starts, False if it ends."""
     refused: str = ""
-    """Reason why a scheduled change was refused; empty if it took effect."""
+    """Reason for refusing a scheduled change; empty if the change took effect."""
 
     def __str__(self) -> str:
         what = f"{self.place}:{name_and_value(self.fault, self.value)} {'on' if self.on else 'off'}"
@@ -50,7 +50,7 @@ class FaultEvent:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Patches and buses of a fleet, by name, and functions that check and set their faults.
+    """Names of a fleet's patches and buses, and functions that check and set their faults.
 
     The ``check`` functions raise ConfigError if a patch or bus cannot have the given faults.
     """
@@ -64,7 +64,7 @@ class Places:
 
 
 class FleetFaults:
-    """Faults of the patches and buses of a fleet. Methods may be called from any thread.
+    """Faults of a fleet's patches and buses. Methods may be called from any thread.
 
     Args:
         places: Patches and buses of the fleet.
@@ -82,7 +82,7 @@ class FleetFaults:
         self._log: list[FaultEvent] = []
         self.set_patches(dict.fromkeys(places.patches, initial))
 
-    # --- what is injected
+    # --- current faults
 
     def patch(self, name: str) -> Faults:
         """Return the current faults of a patch."""
@@ -109,7 +109,7 @@ class FleetFaults:
     # --- changes
 
     def inject(self, *texts: str, key: str = "--fault") -> None:
-        """Change the named faults. All others remain unchanged.
+        """Change the named faults. All other faults remain unchanged.
 
         Args:
             *texts: Strings such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
@@ -176,7 +176,7 @@ class FleetFaults:
                     for name, value in values.items()
                 ]
 
-    # --- inside
+    # --- internal
 
     def _change(self, changes: Iterable[FaultChange]) -> None:
         with self._lock:

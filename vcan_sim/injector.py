@@ -9,7 +9,7 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Fault injector of one node, which draws faults at random and counts them.
+    """Fault injector of one node. It draws faults at random and counts them.
 
     The random sequence is reproducible: it depends only on the seed, the node-ID and the order of calls. Any
     thread may assign :attr:`faults` at any time.
@@ -29,7 +29,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Draw at random whether one of several faults occurs, and return its name or ""."""
+        """Draw at random which fault occurs, if any, and return its name; "" if none occurs."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""
@@ -41,7 +41,7 @@ class Injector:
         return ""
 
     def loses(self, fault: str | None) -> bool:
-        """Return whether a fault drops a frame, decided at random. If so, count the fault."""
+        """Decide at random whether a fault drops a frame, count the fault if so, and return the decision."""
         if fault is None or not self.draw(getattr(self.faults, fault)):
             return False
         self.count(fault)

@@ -8,9 +8,9 @@
         field = host.fields(timeout_s=5).get()
         assert skin_truth(field).wrench[2] < 0
 
-The option ``--skin-bus`` selects the CAN bus for all tests; by default, they run in virtual time on a
+The option ``--skin-bus`` selects the CAN bus for all tests; by default, tests run in virtual time on a
 simulated bus. When a test fails, the plugin saves the bus trace, the scene, the ground truth and a plot, and
-the test report names the folder.
+names the folder in the test report.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ BUSES: Final = {
     "udp_multicast": ("udp_multicast", ""),
     "vcan0": ("socketcan", "vcan{}"),
 }
-"""python-can interface and channel of each choice of ``--skin-bus``. Braces are replaced by the number of the
-bus in the hand. An empty channel stands for a random channel per test."""
+"""python-can interface and channel for each value of ``--skin-bus``. Braces are replaced by the number of the
+bus in the hand. If the channel is empty, each test uses a random channel."""
 TRUTH_READINGS: Final = 200
-"""Number of most recent readings per patch whose ground truth is saved when a test fails."""
+"""Number of readings per patch, counted back from the last, whose ground truth is saved if a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -71,7 +71,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip a test whose marker ``skin_bus`` does not list the selected bus."""
+    """Skip a test if its ``skin_bus`` marker does not list the selected bus."""
     chosen = item.config.getoption("--skin-bus")
     for marker in item.iter_markers("skin_bus"):
         for bus in marker.args:
@@ -120,13 +120,13 @@ class SkinTest:
         return self.fleet
 
     def bring_up(self, options: dict[str, Any]) -> Host:
-        """Start a host for the hand. It is closed at the end of the test."""
+        """Start a host for the hand. The host is closed at the end of the test."""
         from skinnode.host import Host
 
         return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
 
     def connect(self, bus: str | None = None) -> Any:
-        """Open an endpoint on a bus of the hand. It is closed at the end of the test."""
+        """Open an endpoint on one of the hand's buses. The endpoint is closed at the end of the test."""
         from skinnode.transport import open_can_bus
 
         hand = self.started("skin_can").hand
@@ -181,7 +181,7 @@ class SkinTest:
         return f"{name}-{uuid.uuid4().hex[:8]}"
 
     def _trace(self, bus: Any) -> Callable[[], str]:
-        """Start recording the frames of a bus, and return a function that returns the trace as text."""
+        """Start recording the frames on a bus, and return a function that returns the trace as text."""
         from skinnode.process import clock
         from vcan_sim.trace import Listener, Trace
 
@@ -198,7 +198,7 @@ class SkinTest:
 
 
 class SkinFaults:
-    """Fault injection for the simulated hand of a test."""
+    """Fault injection for a test's simulated hand."""
 
     def __init__(self, test: SkinTest) -> None:
         self._test = test
@@ -209,10 +209,10 @@ class SkinFaults:
         Args:
             place: Name of the patch or bus; None for all patches.
             **faults: Fields of :class:`vcan_sim.faults.Faults`, such as ``lost=0.01`` or ``unplugged=True``;
-                for a bus, of :class:`vcan_sim.bus_attacker.BusFaults`.
+                for a bus, fields of :class:`vcan_sim.bus_attacker.BusFaults`.
 
         Raises:
-            ConfigError: If there is no such patch or bus, or a fault is unknown or out of range.
+            ConfigError: If there is no such patch or bus, or if a fault is unknown or out of range.
         """
         from dataclasses import fields
 
@@ -253,7 +253,7 @@ _TEST: Final = pytest.StashKey[SkinTest]()
 
 @pytest.fixture
 def skin_clock(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """Module ``skinnode.process.clock``. With ``--skin-bus timed``, the test runs in virtual time."""
+    """The module ``skinnode.process.clock``. With ``--skin-bus timed``, the test runs in virtual time."""
     from skinnode.process import clock
     from vcan_sim.virtual_time import VirtualClock
 
@@ -299,9 +299,10 @@ def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
 
 @pytest.fixture
 def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
-    """Function that opens a python-can endpoint on a bus of the hand: ``skin_can(bus=None) -> can.BusABC``.
+    """Function that opens a python-can endpoint on one of the hand's buses: ``skin_can(bus=None)``.
 
-    ``bus`` is the name of the bus; default: the first bus. The endpoint is closed at the end of the test.
+    ``bus`` is the name of the bus; default: the first bus. The function returns a ``can.BusABC``, which is
+    closed at the end of the test.
     """
     return _skin_test.connect
 
@@ -329,7 +330,7 @@ def skin_faults(_skin_test: SkinTest) -> SkinFaults:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Save the data of a simulated hand whose test fails, and name the files in the test report."""
+    """If a test of a simulated hand fails, save the hand's data and list the files in the test report."""
     report = yield
     test = item.stash.get(_TEST, None)
     if test is not None and report.when == "call" and report.failed:

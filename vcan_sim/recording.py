@@ -3,11 +3,11 @@
 ===============  =======================================================================================
 file             content
 ===============  =======================================================================================
-trace.log        every frame, as ``candump -L`` writes it, with the name of the bus as its channel
+trace.log        every frame, in ``candump -L`` format, with the name of the bus as the channel
 truth.npz        for each patch and scan: ``PATCH time_ns`` since 1970, ``PATCH device_time_us`` as in the
-                 scan's summary, ``PATCH displacement_m`` (scans, U, N, 3), and with a scene
-                 ``PATCH wrench`` (scans, 6), N and N m
-faults.jsonl     every start and end of a fault
+                 scan's summary, ``PATCH displacement_m`` (scans, U, N, 3) and, if there is a scene,
+                 ``PATCH wrench`` (scans, 6) in N and N m
+faults.jsonl     the start and end of every fault
 scene.json       the scene, if there is one
 ===============  =======================================================================================
 """
@@ -42,7 +42,7 @@ def channel_of(bus: str) -> str:
 
 
 class Recording:
-    """Recording of a fleet during a ``with`` block, which must enclose that of the fleet.
+    """Recording of a fleet during a ``with`` block, which must enclose the fleet's ``with`` block.
 
     Call :meth:`poll` at least once a minute, because patches store a limited number of readings.
 
@@ -52,7 +52,7 @@ class Recording:
         scene: Scene that the fleet plays; None for random strokes.
 
     Raises:
-        ConfigError: On entry, if the folder exists already or cannot be created.
+        ConfigError: On entry, if the folder already exists or cannot be created.
         BusError: On entry, if a bus cannot be opened.
         OSError: From any method, if a file cannot be written.
     """
@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Record the ground truth of all scans, and all fault changes, since the last call."""
+        """Record the ground truth of all scans and all fault changes since the last call."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

@@ -1,4 +1,4 @@
-"""Replay of recorded CAN traces, with the original timing."""
+"""Replays recorded CAN traces with their original timing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FROM_NODES: Final = frozenset(
 )
 """Kinds of frames that nodes send. Hosts send the other kinds, and possibly heartbeats."""
 _DRAINED_EVERY: Final = 64
-"""Number of sent frames between two clearings of the receive queues."""
+"""Number of frames sent before the receive queues are cleared again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Replayed:
 
     sent: int
     left_out: int
-    """Number of frames left out: frames that were not selected, extended frames and error frames."""
+    """Number of frames left out: unselected frames, extended frames and error frames."""
     refused: int
     """Number of frames that the bus refused."""
     seconds: float
@@ -86,9 +86,9 @@ def replay(
     """Send recorded frames with their original timing.
 
     Args:
-        frames: Recorded frames. A frame whose time is already past is sent immediately.
-        ports: Open endpoint of each channel. Frames of other channels are left out.
-        wait: Function that waits for a number of seconds, and returns True to end the replay.
+        frames: Recorded frames. Overdue frames are sent immediately.
+        ports: Open endpoint for each channel. Frames from other channels are left out.
+        wait: Function that waits for a given number of seconds and returns True to end the replay.
         from_nodes: Whether to send only the frames that nodes send.
 
     Returns:
@@ -119,9 +119,9 @@ def replay(
 
 
 def _drain(port: CanPort) -> None:
-    """Discard all received frames, to keep the receive queue from filling up."""
+    """Discard all received frames to keep the receive queue from filling up."""
     try:
         while port.recv(0.0) is not None:
             pass
-    except BusError:  # sending will report it
+    except BusError:  # the next send reports the error
         return

@@ -1,4 +1,4 @@
-"""Simulated resistance readings of a patch, for the converter of a node."""
+"""Simulated resistance readings of a patch, for a node's converter."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ REMEMBERED_READINGS: Final = 4096
 """Number of recent readings whose times are stored: five minutes at 12.5 scans per second."""
 
 Fault = Callable[[Float, int], Float]
-"""Function that takes a reading (U, K) in ohm and its time in ns, and returns the faulty reading. An open
+"""Function that takes a reading (U, K) in ohms and its time in ns, and returns the faulty reading. An open
 pair of wires reads inf, and a shorted pair reads 0."""
 
 
 class SkinMotion(Protocol):
-    """Skin motion, of a :class:`vcan_sim.default_scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
+    """Skin motion from a :class:`vcan_sim.default_scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
 
     @property
     def layout(self) -> PatchLayout:
@@ -40,7 +40,7 @@ class SkinMotion(Protocol):
         """Number of the patch in the hand. Patches with different numbers have different noise."""
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the upper electrodes at scene time ``t_s``, m.
+        """Return the positions (U, N, 3) of the upper electrodes at scene time ``t_s``, in metres.
 
         At rest, the result is ``layout.upper_m`` itself.
         """
@@ -50,16 +50,16 @@ class SimulatedPatch:
     """Resistances of a patch in a scene, as read by a noisy converter.
 
     This class implements :class:`skinnode.node.ResistanceSource`. The skin is at rest until :meth:`start`
-    begins the scene, so the tare at power-on sees an untouched patch. :meth:`truth_m` returns the ground
-    truth at any time, and :meth:`read_ns` the time of a scan.
+    begins the scene, so the tare at power-on measures an untouched patch. :meth:`truth_m` returns the ground
+    truth at any time, and :meth:`read_ns` returns the time of a scan.
 
     Args:
         scene: Motion of the skin.
-        converter_noise: Standard deviation of a reading, relative to the resistance; default: that of the
-            simulation settings.
+        converter_noise: Standard deviation of a reading, relative to the resistance; default: the value in
+            the simulation settings.
         fault: Function applied to each noisy reading.
-        imperfections: Deviations of the patch from its layout. The number of the patch selects the random
-            errors.
+        imperfections: Deviations of the patch from its layout. The random errors depend on the number of the
+            patch.
 
     Raises:
         ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
@@ -76,7 +76,7 @@ class SimulatedPatch:
         self.scene = scene
         self.fault = fault
         self.reads = 0
-        """Number of readings so far, including those of the tare."""
+        """Number of readings so far, including readings for the tare."""
         self.last_read_ns = 0
         """Time of the last reading, ns."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
@@ -97,13 +97,13 @@ class SimulatedPatch:
         return self._origin_ns is not None
 
     def start(self, t_ns: int) -> None:
-        """Start the scene at ``t_ns``, or start it again."""
+        """Start or restart the scene at ``t_ns``."""
         self._origin_ns = t_ns
 
     def read(self, t_ns: int) -> Float:
-        """Return a noisy reading of the resistances (U, K) at ``t_ns`` in ohm.
+        """Return a noisy reading of the resistances (U, K) at ``t_ns`` in ohms.
 
-        The seed and the number of the reading determine the noise; the time does not matter.
+        The noise depends only on the seed and the number of the reading, not on the time.
         """
         self.reads += 1
         self.last_read_ns = t_ns
@@ -114,16 +114,16 @@ class SimulatedPatch:
         return read if self.fault is None else self.fault(read, t_ns)
 
     def exact_ohm(self, t_ns: int) -> Float:
-        """Return the noise-free resistances (U, K) at ``t_ns`` in ohm."""
+        """Return the noise-free resistances (U, K) at ``t_ns`` in ohms."""
         t_s = self.scene_s(t_ns)
         return self.skin.rest_ohm if t_s is None else self.skin.analogue_ohm(t_s, self.scene.upper_m)
 
     def read_ns(self, device_time_us: int) -> int:
-        """Return the time of a reading, ns.
+        """Return the time of a reading, in ns.
 
         Args:
-            device_time_us: Time of the reading on the clock of the node, µs, modulo 2³². The lowest 6 bits
-                are ignored, because a summary with a check does not contain them.
+            device_time_us: Time of the reading on the node's clock, µs, modulo 2³². The lowest 6 bits are
+                ignored, because a summary with a check does not contain them.
 
         Raises:
             LookupError: If no stored reading has this time.
@@ -136,7 +136,7 @@ class SimulatedPatch:
             ) from None
 
     def read_times_ns(self) -> list[int]:
-        """Return the times of the last :data:`REMEMBERED_READINGS` readings, ns, oldest first."""
+        """Return the times (ns) of the last :data:`REMEMBERED_READINGS` readings, oldest first."""
         return list(self._read_ns.values())
 
     def truth_m(self, t_ns: int) -> Float:
@@ -154,13 +154,13 @@ class SimulatedPatch:
         """Return the true displacement of the electrodes during a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: :meth:`truth_m` minus the actual positions at rest. This is what solvers
-            estimate, because they compare readings with a baseline.
+            (U, N, 3) float64, m: :meth:`truth_m` minus the actual positions at rest. Solvers estimate
+            this displacement, because they compare readings with a baseline.
         """
         return np.asarray(self.truth_m(t_ns) - self.skin.rest_m)
 
     def scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time at ``t_ns``, s; None if the scene has not begun."""
+        """Return the scene time (s) at ``t_ns``; None if the scene has not begun."""
         return None if self._origin_ns is None else (t_ns - self._origin_ns) * 1e-9
 
     def _remember(self, t_ns: int) -> None:
@@ -172,8 +172,8 @@ class SimulatedPatch:
 def simulated(layout: PatchLayout) -> SimulatedPatch:
     """Return a simulated patch with random touches: the source ``simulated`` of ``skinnode node``.
 
-    The scene starts immediately. The first touch comes after 0.8 s, which leaves the patch untouched during
-    the tare at power-on.
+    The scene starts immediately. The first touch occurs after 0.8 s, so the patch is untouched during the
+    tare at power-on.
     """
     source = SimulatedPatch(Scene(layout))
     source.start(clock.monotonic_ns())

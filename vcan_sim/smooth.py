@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 GLIDE_RAMP: Final = 0.2
-"""Duration of each of the two ramps of :func:`glide`, as a fraction of the total duration."""
+"""Duration of each ramp in :func:`glide`, as a fraction of the total duration."""
 
 
 def ease(share: float) -> float:
@@ -21,7 +21,7 @@ def ease(share: float) -> float:
 
 
 def glide(share: float) -> float:
-    """Return the value of a profile that rises from 0 to 1, at constant speed between two smooth ramps.
+    """Return the value of a profile that rises from 0 to 1, with constant speed between two smooth ramps.
 
     Args:
         share: Elapsed fraction of the duration, clipped to the range 0 to 1.

@@ -1,4 +1,4 @@
-"""Frame counts by kind, for checking the counts of a host against those of the simulated nodes."""
+"""Frame counts by kind, for checking a host's counts against those of the simulated nodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BOOT_UP_DATA: Final = bytes((NmtState.INITIALISING,))
 
 
 class Kind(enum.StrEnum):
-    """Kind of a frame, which follows from its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
+    """Kind of frame, derived from its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
 
     NMT = "NMT"
     SYNC = "SYNC"
@@ -55,7 +55,7 @@ _KIND_OF_ID: Final = [
 def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
     """Return the kind of a frame with an 11-bit identifier.
 
-    Remote frames are a kind of their own. The length of a frame does not matter.
+    All remote frames are of the kind ``REMOTE``. The kind does not depend on the frame length.
     """
     if remote:
         return Kind.REMOTE
@@ -64,7 +64,7 @@ def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
 
 
 class Tally:
-    """Counts of the frames of one node, by kind.
+    """Counts of one node's frames, by kind.
 
     For sent frames, ``handed = emitted + lost + silenced + refused + waiting``. For received frames,
     ``heard = taken + lost_in + unheard``.
@@ -93,7 +93,7 @@ class Tally:
         """Frames not received because the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return a description of each kind of frame whose counts are inconsistent.
+        """Return a description of each inconsistency in the counts, by kind of frame.
 
         Call this method only while the node is idle.
         """

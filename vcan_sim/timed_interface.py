@@ -29,7 +29,7 @@ from vcan_sim.timed_bus import (
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
 COALESCED_NS: Final = 1_000_000
-"""Minimum interval between two wake-ups of a thread that reads frames, ns."""
+"""Minimum interval between wake-ups of a thread that reads frames, ns."""
 MOST_STATIONS: Final = 64
 """Maximum number of endpoints that can be opened on a bus. Closed endpoints count too."""
 
@@ -38,7 +38,7 @@ class Inbox:
     """Receive queue of a station.
 
     The first frame after a pause wakes the reader immediately. Frames that arrive within the next
-    :data:`COALESCED_NS` wake it once, at the end of that interval, like interrupt coalescing in CAN
+    :data:`COALESCED_NS` wake it once, at the end of that interval, as with interrupt coalescing in CAN
     controllers. The time stamps of the frames are not affected.
 
     Args:
@@ -92,7 +92,7 @@ class Inbox:
 
 
 class Segment:
-    """Simulated bus in virtual time, with its endpoints.
+    """Simulated bus in virtual time, and its endpoints.
 
     Args:
         channel: Name of the bus.
@@ -115,7 +115,7 @@ class Segment:
         self._connected: set[int] = set()
         self._due_ns: int | None = None
         self.cpu_ns: Counter[str] | None = None
-        """CPU time spent on simulating the bus, ns, by thread name; None if it is not measured."""
+        """CPU time (ns) spent on simulating the bus, by thread name; None if it is not measured."""
 
     def join(self) -> int:
         """Connect a new station and return its number."""
@@ -128,7 +128,7 @@ class Segment:
         return station
 
     def leave(self, station: int) -> None:
-        """Disconnect a station for good once its queued frames have been sent, like a closed socket."""
+        """Disconnect a station permanently once its queued frames have been sent, like a closed socket."""
         self._leaving.add(station)
         self._disconnect()
         self._plan()
@@ -213,7 +213,7 @@ def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
     """Return the bus ``channel`` of a virtual clock. The first call creates it.
 
     Raises:
-        can.CanInitializationError: If the bus exists with different bit rates.
+        can.CanInitializationError: If the bus already exists with different bit rates.
     """
     name = f"bus {channel}"
     if name not in clock.shared:
@@ -221,7 +221,7 @@ def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
     found = cast(Segment, clock.shared[name])
     if found.rates != rates:
         raise can.CanInitializationError(
-            f"{channel}: got {rates}, must be {found.rates} as at the first call"
+            f"{channel}: got {rates}, must be {found.rates} as in the first call"
         )
     return found
 
@@ -238,8 +238,8 @@ class TimedInterface(can.BusABC):
         **options: Ignored.
 
     Raises:
-        can.CanInitializationError: If the calling thread does not run in virtual time, or the bus exists with
-            different bit rates.
+        can.CanInitializationError: If the calling thread does not run in virtual time, or if the bus already
+            exists with different bit rates.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ class TimedInterface(can.BusABC):
         self._inbox.on_arrival = function
 
     def hold_until(self, t_ns: int) -> None:
-        """Announce no frames before ``t_ns``."""
+        """Do not signal the arrival of frames before ``t_ns``."""
         self._inbox.hold_until(t_ns)
 
     def _check_open(self) -> None:

@@ -1,4 +1,4 @@
-"""Traces of the frames on a bus, in the log format of ``candump -L``."""
+"""Traces of the frames on a bus, in ``candump -L`` log format."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _POLL_S: Final = 0.05
 """Maximum wait for the next frame, s."""
 
 _LAST_FRAMES: Final = 10_000
-"""Maximum number of frames that a listener still reads after it has been stopped."""
+"""Maximum number of frames that a listener reads after it has been stopped."""
 
 
 class Trace:
-    """Recorder of all further frames on a timed bus, each stamped with the time of its end.
+    """Records all subsequent frames on a timed bus, each stamped with the time at which it ends.
 
     Args:
         of: Bus to record.
@@ -49,12 +49,12 @@ class Trace:
 
 
 class Listener:
-    """Recorder of the frames on a bus during a ``with`` block, through an endpoint of its own.
+    """Records the frames on a bus during a ``with`` block, through its own endpoint.
 
     Args:
         bus: Bus to record.
-        write: Function called with each line of the trace, in the thread of the listener; by default, lines
-            are kept for :meth:`text`.
+        write: Function called with each line of the trace, in the listener's thread; by default, lines are
+            kept for :meth:`text`.
         channel: Name of the channel in the trace; default: the channel of the bus.
 
     Raises:

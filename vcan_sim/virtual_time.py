@@ -2,14 +2,14 @@
 
 Threads are real threads, but only one runs at a time. A thread runs until it waits for an event, a queue, a
 lock, another thread or a time. The thread that became ready first runs next. If no thread is ready, the clock
-jumps to the next time at which one wakes up. Computation takes no virtual time. A program therefore runs in
-the same order and at the same virtual times on every machine, and a minute of waiting takes no real time::
+jumps to the next time at which a thread wakes up. Computation takes no virtual time. A program therefore runs
+in the same order and at the same virtual times on every machine, and a minute of waiting takes no real time::
 
     with VirtualClock():
         with Fleet(hand), skinnode.Host(hand) as host:  # host and nodes on a bus with interface "timed"
             field = host.next_field(timeout_s=5.0)
 
-A thread that waits without :mod:`skinnode.process.clock`, for example on a socket, a subprocess or a
+A thread that waits without using :mod:`skinnode.process.clock`, for example on a socket, a subprocess or a
 ``threading`` event, blocks the whole program.
 """
 
@@ -34,25 +34,25 @@ START_NS: Final = 1_000_000_000_000
 START_WALL_NS: Final = 1_600_000_000_000_000_000
 """Start time (ns since 1970) of a virtual clock: 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
-"""Number of clock readings without a wait after which a thread counts as polling."""
+"""Number of clock readings without a wait after which a thread is considered to be polling."""
 POLL_S: Final = 1e-4
-"""Time by which each clock reading suspends a polling thread, s."""
+"""Time for which each clock reading suspends a polling thread, s."""
 
 
 class Deadlock(RuntimeError):
-    """Every thread waits for another thread, and no timer is pending."""
+    """Every thread is waiting for another thread, and no timer is pending."""
 
 
 class VirtualClock:
-    """Virtual clock of the thread that enters the ``with`` block, and of all threads started from it.
+    """Virtual clock for the thread that enters the ``with`` block and all threads started from it.
 
     All threads started in the block must end before the block does.
 
     Attributes:
-        shared: Objects of which there is one per clock, such as simulated buses, by name.
+        shared: Objects that exist once per clock, such as simulated buses, by name.
 
     Raises:
-        Deadlock: In the thread that entered the block, if all threads wait for each other.
+        Deadlock: In the thread that entered the block, if all threads are waiting for each other.
         RuntimeError: On leaving the block, if a thread is still running.
     """
 
@@ -61,7 +61,7 @@ class VirtualClock:
         self._now_ns = START_NS
         self._readings = 0  # number of clock readings by the running thread since its last wait
         self._ready: deque[_Turn] = deque()
-        # Waits of the first thread that a signal handler has ended with an exception, with turn.waits.
+        # Waits of the first thread ended by an exception from a signal handler: the turn and its ``waits``.
         self._interrupted: deque[tuple[_Turn, int]] = deque()
         self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
         self._number = itertools.count()
@@ -90,7 +90,7 @@ class VirtualClock:
             raise RuntimeError(f"virtual time: threads {names} have not ended")
 
     def _make_turns_cheap(self) -> None:
-        """Pin the current thread to one CPU, and set the policy SCHED_BATCH. Its threads inherit both.
+        """Pin the current thread to one CPU, and set its policy to SCHED_BATCH. New threads inherit both.
 
         Only one thread runs at a time, and handing over to a thread on another CPU takes several times as
         long, because that CPU is usually idle and must wake up first. With SCHED_BATCH, a woken thread does
@@ -112,10 +112,10 @@ class VirtualClock:
         return self._now_ns
 
     def monotonic_ns(self) -> int:
-        """Return the monotonic virtual time, ns.
+        """Return the monotonic virtual time, in ns.
 
-        A thread that reads the clock more than :data:`READINGS` times without waiting is assumed to poll.
-        Each further reading suspends it for :data:`POLL_S`, so that time passes.
+        A thread that reads the clock more than :data:`READINGS` times without waiting is assumed to be
+        polling. Each further reading suspends the thread for :data:`POLL_S`, so that time passes.
         """
         self._readings += 1
         if self._readings > READINGS:
@@ -124,7 +124,7 @@ class VirtualClock:
         return self._now_ns
 
     def made_progress(self) -> None:
-        """Reset the clock readings of the current thread to zero.
+        """Reset the current thread's count of clock readings to zero.
 
         A thread that takes items from a queue is not polling: it waits when the queue is empty.
         """
@@ -188,7 +188,7 @@ class VirtualClock:
             True if :meth:`wake` ended the wait, False if it timed out.
 
         Raises:
-            BaseException: An exception of a signal handler, once it is the turn of this thread.
+            BaseException: An exception raised by a signal handler, once it is this thread's turn.
         """
         turn = self._running
         turn.woken, turn.waiting = False, waiting
@@ -199,7 +199,7 @@ class VirtualClock:
         try:
             self._pass_on(turn)
         except BaseException:
-            if turn.woken:  # the thread will not take what it was woken for
+            if turn.woken:  # wake another thread instead
                 self.wake(waiting)
             raise
         return turn.woken
@@ -236,7 +236,7 @@ class VirtualClock:
         """Block the current thread until it is its turn.
 
         Python runs signal handlers in the main thread, even while another thread has the turn. If a handler
-        raises an exception, this thread becomes ready, and raises the exception when it is its turn.
+        raises an exception, the main thread becomes ready and raises the exception when it is its turn.
         """
         raised: BaseException | None = None
         while True:
@@ -261,7 +261,7 @@ class VirtualClock:
         """Return the turn of the next thread to run, advancing the clock while no thread is ready."""
         while self._interrupted:
             turn, waits = self._interrupted.popleft()
-            if turn.waits == waits:  # otherwise, the wait has ended since
+            if turn.waits == waits:  # otherwise, the wait has already ended
                 turn.waits += 1
                 turn.waiting.remove(turn)
                 self._ready.append(turn)
@@ -294,7 +294,7 @@ def _closed_gate() -> threading.Lock:
 
 
 class _Turn:
-    """Scheduling state of one thread: the gate that blocks it, and what it waits for."""
+    """Scheduling state of one thread: the gate that blocks it and the condition that it waits for."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -304,7 +304,7 @@ class _Turn:
         self.waiting: deque[_Turn] = deque()
         """Threads that wait for the same condition, including this one."""
         self.waits = 0
-        """Number of completed waits. Timers of earlier waits carry a smaller number and are ignored."""
+        """Number of completed waits. Timers from earlier waits have a smaller number and are ignored."""
         self.error: Exception | None = None
 
 
@@ -381,7 +381,7 @@ class Mailbox(_Queue):
         self.queue.append(item)
 
     def wake(self) -> None:
-        """If the queue has items, wake the thread that has waited longest."""
+        """If the queue has items, wake the thread that has been waiting longest."""
         if self.queue:
             self._of.wake(self._waiting)
 

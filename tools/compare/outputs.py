@@ -1,7 +1,7 @@
-"""Computes the results of a commit for given inputs and saves them as named arrays.
+"""Compute a commit's results for given inputs, and save them as named arrays.
 
 Run ``python outputs.py FOLDER OUT.npz [PART ...]`` in the source tree of the commit. The script uses only the
-public API and the command line, so that it works with both commits.
+public API and the command line, so it runs on both of the commits being compared.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NOISES = {"quiet": 1e-6, "noisy": 1e-3}
 
 
 def field_arrays(field: sk.FieldFrame) -> Arrays:
-    """Convert a field to named arrays, without its time stamps."""
+    """Convert a field, except its time stamps, to named arrays."""
     found: Arrays = {
         "status": np.array([int(each) for each in field.status]),
         "counts": np.array([field.stats.evaluations, field.stats.jacobians, field.stats.steps]),
@@ -58,7 +58,7 @@ def field_arrays(field: sk.FieldFrame) -> Arrays:
 
 
 def stacked(fields: list[sk.FieldFrame]) -> Arrays:
-    """Stack the fields of a stream, one array per quantity; arrays of varying shape are concatenated."""
+    """Stack a stream's fields into one array per quantity; concatenate arrays that differ in shape."""
     each = [field_arrays(field) for field in fields]
     found: Arrays = {}
     for name in sorted({name for one in each for name in one}):
@@ -219,8 +219,7 @@ def recordings(folder: Path) -> Iterator[tuple[str, Arrays]]:
 
 
 def commands(_folder: Path) -> Iterator[tuple[str, Arrays]]:
-    """Yield the output of the commands that generate EDS, DCF and hand files or list the conformance
-    cases."""
+    """Yield the output of commands that generate EDS, DCF and hand files or list conformance cases."""
     code = "import sys; from skinnode.cli.main import main; sys.exit(main())"
     for text in (
         *("eds", "eds --code-bits 24 --fd", "eds --upper-wires 7 --lower-wires 21 --lower-electrodes 4"),

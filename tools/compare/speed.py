@@ -1,9 +1,9 @@
 """Compare the benchmark times of two commits: ``python -m tools.compare.speed OLD [NEW]``.
 
-NEW defaults to the working tree. Each round runs the benchmark once per commit. The commits take turns in
-running first, so that changes in the speed of the machine affect both equally. For each benchmark row, the
-report gives the shortest time of each commit and the ratio of the two. The times of NumPy and LAPACK do not
-depend on the commit, so their ratios show the timing noise of the machine.
+NEW defaults to the working tree. Each round runs the benchmark once per commit. The commits take turns
+running first, so that changes in machine speed affect both equally. For each benchmark row, the report gives
+the shortest time of each commit and the ratio of these times. The times of NumPy and LAPACK do not depend on
+the commit, so their ratios show the machine's timing noise.
 
 The exit status is 1 if the ratio of new to old time exceeds ``--limit`` in any row, otherwise 0.
 """

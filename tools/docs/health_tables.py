@@ -18,7 +18,7 @@ _PLAIN: Final = {
     "NEVER_SEEN": "No frame from the patch has arrived since the host started.",
     "OPERATIONAL": "All is well.",
 }
-"""Descriptions of the conditions without a docstring."""
+"""Descriptions of conditions that have no docstring."""
 
 
 def conditions() -> str:
@@ -62,7 +62,7 @@ def bus_faults() -> str:
 
 
 def imperfections() -> str:
-    """Return a table of the imperfections of simulated patches, with the values for an ordinary patch."""
+    """Return a table of patch imperfections, with their values for an ordinary simulated patch."""
     docs, ordinary = md.member_docs(Imperfections), Imperfections.ordinary()
     rows = [
         (md.code(name), docs[name], _size(getattr(ordinary, name)))

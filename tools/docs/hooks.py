@@ -1,6 +1,6 @@
 """MkDocs hooks that replace each `<!-- generated: NAME -->` line with a table generated from the code.
 
-The build fails if NAME is not a known table, or if no page uses a table.
+The build fails if NAME is not a known table, or if a table is not used on any page.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def c_hex(value: int, digits: int = 4) -> str:
 
 
 def member_docs(kind: type) -> dict[str, str]:
-    """Return the docstrings of a class's members, keyed by member; each follows its member in the source."""
+    """Return the docstrings that follow a class's members in the source, keyed by member name."""
     (body,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(body, ast.ClassDef)
     docs: dict[str, str] = {}

@@ -28,11 +28,11 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 in most objects. The tables omit this sub-index, because its value follows from the
-others."""
+"""Name of sub-index 0 in most objects. The tables omit this sub-index, because its value can be derived
+from the other sub-indices."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of similar entries that have one row each; a larger number shares one row."""
+"""Maximum number of similar entries listed in separate rows; longer runs share one row."""
 
 
 def cob_ids() -> str:
@@ -100,7 +100,7 @@ def formats() -> str:
 
 
 def example_scan() -> str:
-    """Show the bytes of the frames for a scan of a pressed patch."""
+    """Show the bytes of some frames from a scan of a pressed patch."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -126,8 +126,8 @@ def example_scan() -> str:
     values = ", ".join(f"{int(code)} (`{int(code):04X}`)" for code in codes[0, :3])
     return (
         "```text\n" + "\n".join(lines) + "\n```\n\n"
-        f"Resistances of {resistance[0, 0]:g}, {resistance[0, 1]:g} and infinite ohm with a baseline of "
-        f"{baseline[0, 0]:g} ohm have the codes {values}; on the bus, the low byte is sent first. "
+        f"Resistances of {resistance[0, 0]:g} ohm, {resistance[0, 1]:g} ohm and infinity, with a baseline of "
+        f"{baseline[0, 0]:g} ohm, have the codes {values}; on the bus, the low byte is sent first. "
         f"The code of an open wire is {scale.open}, that of a short circuit is {scale.short}, and that of a "
         f"value out of range is {scale.over_range}."
     )
@@ -219,7 +219,7 @@ def _shape(item: Object) -> list[tuple[object, ...]]:
 
 
 def _family(item: Object) -> str:
-    """Return an object's name without the number at its end, for example `Codes of upper wire`."""
+    """Return an object's name without its trailing number, for example `Codes of upper wire`."""
     return item.name.rstrip("0123456789")
 
 

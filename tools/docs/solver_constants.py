@@ -20,7 +20,7 @@ _NOT_TUNED: Final = {
     *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
     *("ROWS", "TILE", "REST", "TINY", "SQUARE_FLOOR", "A_MIN", "A_MAX", "NOISE_MAX"),
 }
-"""Constants left out of the table, because they do not affect results: task flags, tile sizes, overflow
+"""Constants left out of the table because they do not affect results: task flags, tile sizes and overflow
 limits."""
 
 

@@ -1,12 +1,12 @@
 """Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
-The mutation operators are those of cosmic-ray. Places in the source are drawn with equal probability, then
-one mutation for each place. If mutations were drawn directly, a ``+``, to which eleven apply, would be drawn
-eleven times as often as a ``not``, to which one applies.
+The mutation operators come from cosmic-ray. Places in the source are drawn with equal probability, and
+then one mutation is drawn for each place. If mutations were drawn directly, a ``+``, which has eleven
+mutations, would be drawn eleven times as often as a ``not``, which has one.
 
-A mutant is identified by its file, function and operator and by the text before and after the change, so a
-list of mutants remains valid when code moves. Places are ranked by a hash of the seed and of their source
-text, so an edit hardly changes which other places are drawn.
+A mutant is identified by its file, function and operator, and by the text before and after the change, so a
+list of mutants remains valid when code moves. Places are ranked by a hash of the seed and their source text,
+so an edit has little effect on which other places are drawn.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Packages of each group; mutants are drawn for each group separately."""
+"""Packages in each group; mutants are drawn separately for each group."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -59,7 +59,7 @@ class Mutant:
     after: str
     """Lines added by the change."""
     nth: int
-    """Index among the mutants of the file that are equal in all other fields, counted from 0."""
+    """Zero-based index among the file's mutants that are equal in all other fields."""
 
     @property
     def name(self) -> str:
@@ -85,7 +85,7 @@ class _Candidate:
 
 
 class _OnlyBehaviour(ast.NodeTransformer):
-    """Remove parts of the syntax tree that tests need not check: annotations, f-strings, speed decorators."""
+    """Remove parts of the syntax tree that need no tests: annotations, f-strings and speed decorators."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         node.annotation = ast.Constant(0)
@@ -117,7 +117,7 @@ class _OnlyBehaviour(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> Any:
         if isinstance(node.func, ast.Name) and node.func.id == "dataclass":
-            node.keywords = []  # mypy reports the mistakes prevented by frozen and slots
+            node.keywords = []  # mypy catches the mistakes that frozen and slots prevent
         return self.generic_visit(node)
 
     def visit_If(self, node: ast.If) -> Any:
@@ -138,7 +138,7 @@ def _behaviour(source: str) -> str | None:
     try:
         with warnings.catch_warnings(
             action="ignore"
-        ):  # for example, a mutant that compares a literal with "is"
+        ):  # a mutant may cause a warning, for example by comparing a literal with "is"
             compile(source, "mutant", "exec")
     except (SyntaxError, ValueError):
         return None
@@ -195,7 +195,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Convert a candidate to a mutant; ``nth`` counts the equal mutations before it in the file."""
+    """Convert a candidate to a mutant; ``nth`` is the number of equal mutations before it in the file."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))

@@ -2,7 +2,7 @@
 
 Each mutant is applied to a private copy of the repository, on which the test stages of ``stages.toml`` are
 run. A mutant is killed if a test fails or if a stage exceeds its time limit. The failure of a real-time test
-counts only if the test also fails when run alone.
+counts only if the test also fails when it is run alone.
 
 Each verdict is written to ``results.json`` immediately. Later runs skip mutants that have a verdict;
 ``--again`` tests the surviving mutants again.
@@ -52,7 +52,7 @@ _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
 """Time limit for a single test, s."""
 _GRACE_S: Final = 60.0
-"""Constant part of a stage's time limit, s; six times the duration on unmutated code is added to it."""
+"""Fixed part of a stage's time limit, s. Six times its duration on unmutated code is added."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
@@ -69,7 +69,7 @@ class Outcome:
 
 
 class Tree:
-    """Private copy of the repository, with a cache of the kernels compiled from it."""
+    """Private copy of the repository, and a cache of the kernels compiled from it."""
 
     def __init__(self, folder: Path) -> None:
         self.source, self.cache, self.warm = folder / "tree", folder / "cache", folder / "warm"
@@ -106,7 +106,7 @@ class Tree:
         """Apply a mutant to the copy, and remove the compiled kernels that it affects.
 
         numba recompiles the kernels of a file that has changed, but not the kernels of other files that
-        depend on it. This method removes the latter.
+        depend on it, so this method removes the latter.
         """
         path = self.source / mutant.file
         found = path.stat()
@@ -236,7 +236,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         failures = _Failures()
         options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        options += ["-W", "ignore::SyntaxWarning"]  # for example, a mutant that compares a literal with "is"
+        options += ["-W", "ignore::SyntaxWarning"]  # for example, "is" with a literal
         status = int(pytest.main([*options, *arguments], plugins=[failures]))
         answer.write_text(json.dumps(failures.failed), "utf-8")
     except BaseException:
@@ -248,7 +248,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
 
 
 def _end_children(group: int) -> None:
-    """Kill all processes in a group, then all other children, which may have left the group."""
+    """Kill all processes in a group, then any other children, which may have left the group."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     for _ in range(100):
@@ -283,7 +283,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 class Session:
-    """Runs tests on a tree, with the results on unmutated source code as a reference."""
+    """Runs tests on a tree, using the results on unmutated source code as a reference."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -308,7 +308,7 @@ class Session:
                 )
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
-            ]  # a test that passes alone probably failed under CPU load
+            ]  # a test that passes when run alone probably failed because of CPU load
             for test in failed:
                 print(f"test excluded because it fails on unmutated source code: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}
@@ -368,7 +368,7 @@ def show(mutant: Mutant) -> str:
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return one line per group with its numbers of mutants by verdict, then the surviving mutants."""
+    """Return one line per group with the number of mutants for each verdict, then the surviving mutants."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")
@@ -385,7 +385,7 @@ def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
 
 
 def _preload() -> None:
-    """Import libraries that load slowly; they are never mutated."""
+    """Import libraries that load slowly and are never mutated."""
     import can  # noqa: F401
     import canopen  # noqa: F401
     import hypothesis  # noqa: F401

@@ -1,4 +1,4 @@
-"""Typer application ``vcan-sim`` with its commands."""
+"""Typer application for ``vcan-sim`` and its commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class _Group(Group):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Return completions of the first word: commands, and options of the default command."""
+        """Return completions for the first word: commands, and options of the default command."""
         own, of_default = (
             super().shell_complete(ctx, incomplete),
             self.commands[DEFAULT].shell_complete(ctx, incomplete),

@@ -9,7 +9,7 @@ import typer
 Simulator = Annotated[
     str | None,
     typer.Option(
-        help="Process-ID of the simulator or name of its hand. Required if several are running.",
+        help="Process ID of the simulator, or name of its hand. Required if several are running.",
         metavar="PID|HAND",
     ),
 ]
@@ -26,7 +26,7 @@ def inject(
     ] = None,
     simulator: Simulator = None,
 ) -> None:
-    """Change the faults of a running simulator; print current faults and counts of injected faults.
+    """Change the faults of a running simulator; print the current faults and the counts of injected faults.
 
     The faults have the same form as in `vcan-sim run --fault`. Faults that are not listed remain unchanged.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def list_scenes() -> None:
-    """List the scenes that come with the simulator, for `vcan-sim run --scene NAME`.
+    """List the scenes that come with the simulator, for use with `vcan-sim run --scene NAME`.
 
     A scene can be played on a hand that has all patches named in the scene.
     """

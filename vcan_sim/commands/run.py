@@ -68,7 +68,7 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     """
     from skinnode.config import load_hand
 
-    plan = load_hand(hand).on(interface, channel)  # before the imports that take a second
+    plan = load_hand(hand).on(interface, channel)  # reports errors before the slow imports
     from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
     from vcan_sim.fleet import Fleet
@@ -159,7 +159,7 @@ def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[Node
 
 
 def _too_slow(before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
-    """Return a warning if this machine was too busy and scans were skipped; otherwise, return ""."""
+    """Return a warning if scans were skipped because this machine was too busy; otherwise, return ""."""
     steps = list(zip(before, now, strict=True))
     skipped = sum(new.slow_overruns - old.slow_overruns for old, new in steps)
     if not skipped:
@@ -182,7 +182,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return the counts of injected faults, one line per patch and per bus with faults."""
+    """Return the counts of injected faults: one line per patch, and one per bus with injected faults."""
     lines = []
     for place, counts in fleet.counts().items():
         shown = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -205,7 +205,7 @@ def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> I
 
 @contextmanager
 def _controlled(fleet: Fleet) -> Iterator[None]:
-    """Open the control socket for `vcan-sim inject`. If this is impossible, print a note."""
+    """Open the control socket for `vcan-sim inject`. If that fails, print a note."""
     from vcan_sim.control import ControlError, ControlServer
 
     with ExitStack() as entered:

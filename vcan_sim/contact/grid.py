@@ -1,4 +1,4 @@
-"""Grid of square cells on the surface, and the displacement due to tractions on them, by FFT.
+"""Grid of square cells on the surface; computes the displacement due to tractions on the cells, by FFT.
 
 The displacement is the convolution of the tractions with the response to a single cell. Zero padding to at
 least twice the number of cells along each axis prevents wrap-around (Liu, Wang and Liu, Wear 243, 101, 2000).
@@ -21,7 +21,7 @@ class Grid:
 
     Attributes:
         layer: Elastic layer under the cells.
-        shape: Numbers of cells along x and y.
+        shape: Number of cells along x and along y.
         size_m: Side length of a cell, metres.
     """
 
@@ -38,7 +38,7 @@ class Grid:
 
         Args:
             layer: Elastic layer under the cells.
-            shape: Numbers of cells along x and y.
+            shape: Number of cells along x and along y.
             size_m: Side length of a cell, metres.
         """
         padded = (
@@ -52,7 +52,7 @@ class Grid:
         return cls(layer, shape, size_m, padded, scipy.fft.rfft2(turned))
 
     def centres_m(self, origin_m: Float) -> Float:
-        """Return the cell centres (X, Y, 2) in metres, of which the first is ``origin_m`` (2,)."""
+        """Return the cell centres (X, Y, 2) in metres; the first is at ``origin_m`` (2,)."""
         x, y = (np.arange(n) * self.size_m for n in self.shape)
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + origin_m
 
@@ -78,7 +78,7 @@ class Grid:
         """Upper bound on the eigenvalues of the shear compliance matrix, m/Pa.
 
         The bound is an estimate by power iteration plus a margin of 10 %. It also holds for every subset of
-        the cells, whose compliance is a principal submatrix of a symmetric matrix.
+        the cells, because the compliance of a subset is a principal submatrix of this symmetric matrix.
         """
         vector = np.ones((2, *self.shape))
         largest = 0.0

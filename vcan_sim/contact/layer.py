@@ -1,7 +1,7 @@
 """Surface displacement of an elastic layer bonded to a rigid base.
 
-A sinusoidal surface traction of unit amplitude and wave number k displaces the surface by these amplitudes,
-where h is the thickness and x = k h:
+A sinusoidal surface traction of unit amplitude and wave number k displaces the surface with the following
+amplitudes, where h is the thickness and x = k h:
 
     normal, due to normal traction       (1 − ν) / (G k) · (2κ sinh 2x − 4x) / D
     along k, due to traction along k     (1 − ν) / (G k) · (2κ sinh 2x + 4x) / D
@@ -29,7 +29,7 @@ Float = NDArray[np.float64]
 DEEPEST: Final = 14.0
 """Value of x = k h above which the layer is treated as a half-space, with a relative error below 2e-10."""
 STEPS: Final = 32
-"""Table points per layer thickness, in tables of displacement against distance."""
+"""Number of points per layer thickness in tables of displacement versus distance."""
 NODES: Final = 16
 """Number of Gauss-Legendre quadrature nodes per panel."""
 
@@ -72,7 +72,7 @@ class Layer:
         return self.young_pa / (1.0 - self.poisson**2)
 
     def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
-        """Return the four amplitudes of the module docstring, in that order, multiplied by k (1/Pa).
+        """Return the four amplitudes given in the module docstring, in that order, multiplied by k (1/Pa).
 
         Args:
             wave_number_per_m: Array of wave numbers k > 0, 1/m.
@@ -140,15 +140,15 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
     """Return the surface displacement under a uniform unit traction on a square cell at the origin.
 
     The displacement of a half-space has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
-    generalisation of Johnson, eq. 3.25, to all directions). It combines the integrals of 1/R, x²/R³, y²/R³,
-    xy/R³, x/R² and y/R² over the cell. The difference between layer and half-space is smooth, and is
+    a generalisation of Johnson, eq. 3.25, to all directions). It combines the integrals of 1/R, x²/R³, y²/R³,
+    xy/R³, x/R² and y/R² over the cell. The difference between the layer and a half-space is smooth and is
     integrated by Gauss-Legendre quadrature.
 
     Args:
         layer: Elastic layer.
         offset_m: (…, 2) positions relative to the centre of the cell, metres.
         size_m: Side length of the cell, metres.
-        reach_m: Largest distance of a position from the centre of the cell, metres.
+        reach_m: Maximum distance of any position from the centre of the cell, metres.
 
     Returns:
         (…, 3, 3) displacement per unit traction, m/Pa. The last axis is the direction of the traction.

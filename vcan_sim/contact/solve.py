@@ -55,7 +55,7 @@ class Contact:
 
 
 def untouched(grid: Grid) -> Contact:
-    """Return the state of the skin with no body in contact."""
+    """Return the state of the skin when no body touches it."""
     zero = np.zeros((3, *grid.shape))
     return Contact(zero, zero, np.zeros(grid.shape, bool))
 
@@ -67,7 +67,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         grid: Cells on the surface.
         overlap_m: (X, Y) overlap of the body with the undeformed surface, metres; negative where there is a
             gap.
-        start_pa: (X, Y) initial guess of the pressure, Pa, such as that of the previous time step.
+        start_pa: (X, Y) initial guess for the pressure, Pa, such as the pressure at the previous time step.
         close: Largest permissible residual overlap or gap, relative to the maximum of ``overlap_m``.
 
     Raises:
@@ -91,7 +91,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         active = pressure > 0.0
         if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
-        if not active.any():  # the initial guess was so large that no cell is left in contact
+        if not active.any():  # the initial guess was so large that no cell remains in contact
             pressure, conjugate = _steepest(grid, gap), 0.0
             continue
         square = float((gap[active] ** 2).sum())
@@ -109,7 +109,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y) in Pa: the overlap, scaled by an exact line search."""
+    """Return a pressure (X, Y) in Pa: the overlap scaled by an exact line search."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
@@ -121,7 +121,7 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close:
         grid: Cells on the surface.
         limit_pa: (X, Y) maximum shear traction μ p, Pa.
         target_m: (2, X, Y) displacement of each cell in the absence of slip, metres.
-        start_pa: (2, X, Y) initial guess of the shear traction, Pa.
+        start_pa: (2, X, Y) initial guess for the shear traction, Pa.
         close: Tolerance. The iteration stops when every shear traction changes by less than
             0.1 ``close`` times the maximum of ``limit_pa``.
 
@@ -171,7 +171,7 @@ def advance(  # noqa: PLR0913 - the last two control the search
         overlap_m: (X, Y) overlap of the body with the undeformed surface after the movement, metres.
         slide_m: Tangential movement of the body's surface, metres: (2,), or (2, X, Y) if the body rotates.
         friction: Coefficient of friction μ.
-        start: Initial guess of the new state; default: ``last``. The guess affects only the computing time.
+        start: Initial guess for the new state; default: ``last``. The guess affects only the computing time.
         close: Tolerance, as in :func:`press` and :func:`rub`.
 
     Raises:

@@ -1,16 +1,16 @@
-"""Scenes from files: rigid bodies press on the patches of a hand, and slide, roll or turn in contact.
+"""Scenes from files: rigid bodies press on the patches of a hand, and slide, roll or turn on the skin.
 
 ::
 
     scene file -> tables (keys, checks) -> bind (touch_checks: is the touch possible on its patch?)
         -> PatchScene of each patch
-    shapes, motions (body pose at a time) -> window (cells under the body) -> history (contact at each step)
+    shapes, motions (pose of the body) -> window (cells under the body) -> history (contact at each step)
         -> response (displacement of the electrodes) -> patch (state at any time) -> truth
-    faults (checks with the hand) -> vcan_sim.fault_schedule
+    faults (checked against the hand) -> vcan_sim.fault_schedule
 
 :mod:`vcan_sim.contact`, which shares no code with the solvers, computes the contact mechanics. The skin is
 undeformed before and after each touch. A touch is always computed from its start, at fixed time steps, so the
-state at a given time does not depend on which times are requested, or in which order.
+state at a given time does not depend on which times are requested or in which order.
 """
 
 from vcan_sim.scenes.bind import bind_scene, load_scene

@@ -1,4 +1,4 @@
-"""Applies a scene to a hand: checks the touches, and creates a :class:`PatchScene` for each patch."""
+"""Applies a scene to a hand: checks the touches and creates a :class:`PatchScene` for each patch."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
 
 
 def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
-    """Return the scene of each patch of a hand, by patch name, including untouched patches.
+    """Return the scene of each patch in a hand, by patch name, including untouched patches.
 
     Args:
         scene: Scene of the hand.
@@ -57,7 +57,7 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
 def layer_of(skin: SkinConfig, patch: PatchConfig, layout: PatchLayout) -> Layer:
     """Return the elastic layer of a patch.
 
-    Values of the scene file override those of the hand file.
+    Values in the scene file override those in the hand file.
 
     Args:
         skin: The scene file's ``[skin]`` table.

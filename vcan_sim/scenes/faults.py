@@ -1,4 +1,4 @@
-"""Creates a scene's fault schedule from its ``[[faults]]`` tables, and checks the faults against the hand."""
+"""Creates a scene's fault schedule from its ``[[faults]]`` tables and checks the faults against the hand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
 
     Args:
         scene: Scene with faults.
-        hand: Hand with the patches and buses that the faults name.
+        hand: Hand that contains the patches and buses named by the faults.
 
     Raises:
         ConfigError: If a fault is unknown or out of range, names a patch, a wire or a bus that the hand does
@@ -59,7 +59,7 @@ def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | 
 
 
 def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, str]:
-    """Return the faulty patch or bus, whether it is a bus, and the fault in text form."""
+    """Return the name of the faulty patch or bus, whether it is a bus, and the fault in text form."""
     patches, buses = [patch.name for patch in hand.patches], [bus.name for bus in hand.buses]
     if fault.where in patches:
         return fault.where, False, fault.fault
@@ -90,7 +90,7 @@ def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]
 def _check_together(
     schedule: FaultSchedule, late: TimedFault, hand: HandConfig, shapes: dict[str, tuple[int, int]]
 ) -> None:
-    """Raise ConfigError if a fault contradicts faults that are active when it starts."""
+    """Raise ConfigError if a fault contradicts other faults that are active when it starts."""
     values: dict[str, Any] = {}
     for each in schedule.active(late.from_s):
         if (each.place, each.on_bus) == (late.place, late.on_bus):

@@ -1,8 +1,7 @@
 """Contact mechanics of one touch at fixed time steps.
 
 Friction depends on history, so the time steps are computed in order and stored. The cells belong to a lattice
-that is fixed to the patch. The window follows the body in steps of whole cells, so tractions are never
-interpolated.
+that is fixed to the patch. The window follows the body by whole cells, so tractions are never interpolated.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from vcan_sim.scenes.tables import TouchConfig
 from vcan_sim.scenes.window import CLOSE, Window, centred_m, overlap_m, solve_depth
 
 _LEAST: Final = 1e-5
-"""Depth or force below which contact is neglected, relative to the maximum of the touch."""
+"""Depth or force below which contact is neglected, relative to the maximum during the touch."""
 _LOOSER: Final = (1.0, 10.0, 100.0)
-"""Factors for the tolerance of the contact solver, tried in turn until it converges."""
+"""Factors applied to the contact solver's tolerance, tried in turn until the solver converges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +73,9 @@ class History:
     ) -> None:
         self.touch, self.window, self.step_s = touch, window, step_s
         self.first = math.floor(touch.from_s / step_s)
-        """Number of the first time step. There is no contact before it."""
+        """Number of the first time step. There is no contact before this step."""
         self.last = math.ceil(touch.to_s / step_s)
-        """Number of the last time step. There is no contact after it."""
+        """Number of the last time step. There is no contact after this step."""
         self._shape, self._friction, self._electrodes = shape, friction, electrodes
         self._steps: list[Step | None] = []
         self._contact = untouched(window.grid)
@@ -126,7 +125,7 @@ class History:
         return self._summary(depth)
 
     def _solve(self, pose: Pose, offset_m: Float, slide_m: Float, start: Contact) -> tuple[float, Contact]:
-        """Return the depth (m) and contact at a new pose. ``start`` is the initial guess."""
+        """Return the depth (m) and the contact at a new pose. ``start`` is the initial guess."""
         grid = self.window.grid
 
         def at(depth_m: float) -> Contact:
@@ -151,7 +150,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Move the window with the body, by whole cells. The tractions stay in place on the skin."""
+        """Move the window with the body by whole cells. The tractions stay in place on the skin."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))
@@ -192,11 +191,11 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
 ) -> Contact:
     """Return the contact after the body has moved.
 
-    If the solver does not converge, the tolerance is increased by the factors in ``_LOOSER``. If no tolerance
-    is large enough, the time step is computed without friction.
+    If the solver does not converge, it runs again with the next factor in ``_LOOSER``. If no factor is large
+    enough, the time step is computed without friction.
 
     Raises:
-        NoSolution: If the solver does not converge without friction either.
+        NoSolution: If the solver does not converge even without friction.
     """
     for looser in _LOOSER:
         try:

@@ -9,7 +9,7 @@ _FOLDER: Final = Path(__file__).with_name("shipped")
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Return the files of the shipped scenes, by name."""
+    """Return the files of the shipped scenes, by scene name."""
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 

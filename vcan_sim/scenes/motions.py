@@ -24,8 +24,8 @@ class Pose:
         slid_m: Displacement (x, y) of the body along the skin since the touch began, excluding rolling,
             metres.
         yaw_rad: Rotation about z, rad.
-        level: Depth (m) of a depth-controlled touch, or normal force (N) of a force-controlled one; 0 without
-            contact.
+        level: Depth (m) of a depth-controlled touch, or normal force (N) of a force-controlled touch; 0 if
+            there is no contact.
     """
 
     place_m: tuple[float, float]
@@ -63,14 +63,14 @@ def pose_at(touch: TouchConfig, t_s: float) -> Pose:
 
 
 def highest_level(touch: TouchConfig) -> float:
-    """Return the maximum normal force (N) or depth (m) of a touch, whichever controls it."""
+    """Return the maximum of a touch's controlled quantity: normal force (N) or depth (m)."""
     levels = [touch.force_n if touch.by_force else touch.depth_m]
     levels += [motion.force_n if touch.by_force else motion.depth_m for motion in touch.motions]
     return max(level for level in levels if level is not None)
 
 
 def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
-    """Return yaw angles (rad) that span the rotation during a touch, at most 0.25 rad apart."""
+    """Return yaw angles (rad), at most 0.25 rad apart, that span the rotation during a touch."""
     turned = sum(abs(motion.by_rad or 0.0) for motion in touch.motions)
     if not turned:
         return (touch.yaw_rad,)
@@ -88,7 +88,7 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
 
 
 def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y) of a random walk in metres.
+    """Return the displacement (x, y) in metres during a random walk.
 
     Between targets, the body follows a minimum-jerk profile.
     """
@@ -105,7 +105,8 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
     """Return the targets (x, y) of a random walk in metres, relative to its start.
 
-    They are distributed uniformly over a disc of radius ``reach_m``. The first target is the start itself.
+    The first target is the start itself. The other targets are distributed uniformly over a disc of radius
+    ``reach_m``.
     """
     count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
     random = np.random.default_rng(1 if motion.seed is None else motion.seed)

@@ -1,10 +1,10 @@
 """Skin of one patch in a scene, interpolated between the time steps of the touches.
 
-The state at a given time is the mean of the four nearest time steps, with the weights of a uniform cubic
-B-spline (de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are nonnegative and sum to 1,
-so the mean is physically consistent: pressure is nonnegative, shear traction stays within the friction limit,
-and the displacement is the response of the layer to the tractions. All quantities are twice continuously
-differentiable in time. Motions shorter than four time steps are smoothed.
+The state at a given time is the weighted mean of the four nearest time steps, with the weights of a uniform
+cubic B-spline (de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are nonnegative and sum
+to 1, so the mean is physically consistent: pressure is nonnegative, shear traction stays within the friction
+limit, and the displacement is the response of the layer to the tractions. All quantities are twice
+continuously differentiable in time. Motions shorter than four time steps are smoothed.
 """
 
 from __future__ import annotations
@@ -85,14 +85,14 @@ class PatchScene:
         """Compute the time steps of all touches in advance, rather than on demand.
 
         Args:
-            until_s: End of the computed part of the scene, s.
+            until_s: Scene time up to which the time steps are computed, s.
         """
         for history in self.histories:
             if history.touch.from_s < until_s:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield the touches in contact around ``t_s``, with their weighted time steps."""
+        """Yield each touch in contact around ``t_s`` and its weighted time steps."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)
@@ -106,7 +106,7 @@ class PatchScene:
 
 
 def _spline(share: float) -> tuple[float, float, float, float]:
-    """Return the cubic B-spline weights of four time steps, at ``share`` between the second and third."""
+    """Return cubic B-spline weights of four time steps; ``share`` is the fraction from second to third."""
     s, rest = share, 1.0 - share
     cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
     second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
@@ -114,7 +114,7 @@ def _spline(share: float) -> tuple[float, float, float, float]:
 
 
 def _contact(history: History, steps: Weighted) -> BodyContact:
-    """Return the weighted mean of time steps of a touch, in a window that covers their cells."""
+    """Return the weighted mean of a touch's time steps, in a window that covers their cells."""
     firsts = np.array([step.first for _, step in steps])
     low = firsts.min(axis=0)
     size = (firsts - low).max(axis=0) + np.array(steps[0][1].traction_pa.shape[1:])

@@ -80,7 +80,7 @@ def _forces(axes: Any, times_s: Any, truths: list[PatchTruth], colours: dict[str
 
 
 def _pressures(axes: Any, patch: PatchScene, truth: PatchTruth, colours: dict[str, str]) -> Any:
-    """Plot the electrodes and the pressure of all contacts at one instant, and return the pressure image."""
+    """Plot the electrodes and all contact pressures at one instant, and return the pressure image."""
     highest_kpa = 1e-3 * max(float(contact.pressure_pa.max()) for contact in truth.contacts)
     image = None
     for contact in truth.contacts:

@@ -46,7 +46,7 @@ class Electrodes:
 
     @classmethod
     def of(cls, layer: Layer, places_m: Float, surface_m: float) -> Electrodes:
-        """Return electrodes with a table of the layer's displacement under a point force.
+        """Create electrodes, and tabulate the layer's displacement under a point force.
 
         Args:
             layer: Elastic layer.
@@ -62,8 +62,9 @@ class Electrodes:
         """Return the displacement of the electrodes due to a contact.
 
         Inside the window, cubic polynomials interpolate the displacement of the cells. Outside, electrodes
-        are at least two cells away from any loaded cell, so the traction of a cell acts as a point force at
-        its centre. Beyond ``CLUSTER_CELLS``, the forces of 2 × 2 cells are lumped at their common centre.
+        are at least two cells away from any loaded cell, so the traction on a cell is treated as a point
+        force at its centre. Beyond ``CLUSTER_CELLS``, the forces on each block of 2 × 2 cells are lumped at
+        the centre of the block.
 
         Args:
             grid: Cells of the window.
@@ -134,14 +135,14 @@ def _forces(force_n: Float, origin_m: Float, size_m: float) -> tuple[Float, Floa
 
 
 def _clustered(force_n: Float) -> Float:
-    """Return the forces (3, X/2, Y/2) in N on blocks of 2 × 2 cells, from those (3, X, Y) on cells."""
+    """Return the forces (3, X/2, Y/2) in N on blocks of 2 × 2 cells, given the forces (3, X, Y) on cells."""
     x, y = force_n.shape[1:]
     even = np.pad(force_n, ((0, 0), (0, x % 2), (0, y % 2)))
     return np.asarray(even.reshape(3, (x + 1) // 2, 2, (y + 1) // 2, 2).sum(axis=(2, 4)))
 
 
 def _cubic(field: Float, index: Float) -> Float:
-    """Interpolate a field (3, X, Y) at fractional indices (P, 2) by bicubic polynomials."""
+    """Interpolate a field (3, X, Y) at fractional indices (P, 2) using bicubic polynomials."""
     low = np.clip(np.floor(index).astype(np.intp) - 1, 0, np.array(field.shape[1:]) - 4)
     weights = _lagrange(index - low)
     found = np.zeros((len(index), 3))

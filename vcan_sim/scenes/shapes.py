@@ -1,7 +1,7 @@
-"""Shapes of rigid bodies, given by the height of the lower surface.
+"""Shapes of rigid bodies, defined by the height of their lower surface.
 
-A shape is a function from positions (…, 2) in the body frame, metres, to heights (…,) above the lowest point
-of the body, metres. The height is inf at positions outside the body.
+A shape maps positions (…, 2) in the body frame to heights (…,) above the lowest point of the body, both in
+metres. The height is inf at positions outside the body.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Shape:
     """Shape of a rigid body.
 
     Attributes:
-        height: Function from positions (…, 2) in the body frame to heights (…,) above the lowest point,
+        height: Function that maps positions (…, 2) in the body frame to heights (…,) above the lowest point,
             metres.
         round: Whether the height depends only on the horizontal distance from the lowest point.
         key: Values that determine the height. Shapes with equal keys are equal.
@@ -116,7 +116,7 @@ def ridge(radius_m: float, length_m: float) -> Shape:
 
     Args:
         radius_m: Radius of the cylinder, metres.
-        length_m: Length of the cylinder without its hemispherical ends, metres.
+        length_m: Length of the cylinder, excluding its hemispherical ends, metres.
     """
 
     def height(places_m: Float) -> Float:
@@ -128,5 +128,5 @@ def ridge(radius_m: float, length_m: float) -> Shape:
 
 
 def _rounded(distance_m: Float, radius_m: float) -> Float:
-    """Return the height of a circle above its lowest point, at a horizontal distance from that point."""
+    """Return the height of a circle above its lowest point at a given horizontal distance from that point."""
     return np.asarray(radius_m - np.sqrt(np.maximum(radius_m**2 - distance_m**2, 0.0)))

@@ -50,7 +50,7 @@ _REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
     "press": (),
 }
 KEY_OF_TRAVEL: Final[dict[str, str]] = {"slide": "by_m", "shear": "by_m", "roll": "by_m", "walk": "reach_m"}
-"""Key of the distance travelled, for each kind of motion along the skin."""
+"""Key for the distance travelled, for each kind of motion along the skin."""
 
 _Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Place = Annotated[
@@ -105,7 +105,7 @@ class BodyConfig(Table):
     """Rounding radius (m) of the punch's rim (default: a tenth of the punch radius) or of the box's edge
     (default: 1 mm)."""
     length_m: Length | None = None
-    """Length (m) of the box's edge, or of the ridge without its round ends. At yaw 0, both lie along x."""
+    """Length (m) of the box's edge, or of the ridge excluding its round ends. At yaw 0, both lie along x."""
     slope_rad: _Slope | None = None
     """Angle between the skin and each of the two faces that meet at the box's edge, rad; default: π/4."""
     radii_m: _Radii | None = None
@@ -148,7 +148,7 @@ class MotionConfig(Table):
     to_s: _Time
     """Scene time at which the motion ends, s."""
     by_m: _Place | None = None
-    """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its start."""
+    """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its starting point."""
     by_rad: _Angle | None = None
     """Angle of rotation for ``turn``, rad, counterclockwise as seen from above the skin."""
     depth_m: Length | None = None
@@ -160,7 +160,7 @@ class MotionConfig(Table):
     every_s: _Duration | None = None
     """Time between consecutive random targets of ``walk``, s; default: 0.5."""
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] | None = None
-    """Random seed of ``walk``; default: 1."""
+    """Random seed for ``walk``; default: 1."""
 
     @model_validator(mode="after")
     def _keys_of_kind(self) -> MotionConfig:
@@ -184,7 +184,7 @@ class TouchConfig(Table):
     to_s: _Time
     """Scene time of the last contact, s."""
     ramp_s: _Duration = 0.3
-    """Duration of the press at the start and of the lift at the end (minimum-jerk profiles), s."""
+    """Duration of the initial press and of the final lift, s. Both follow minimum-jerk profiles."""
     depth_m: Length | None = None
     """Depth of the body's lowest point below the undeformed surface, metres. Set either ``depth_m`` or
     ``force_n``."""
@@ -286,7 +286,7 @@ class FaultConfig(Table):
     from_s: _Time = 0.0
     """Scene time at which the faults start, s."""
     to_s: _Time | None = None
-    """Scene time at which the faults end, s; default: the end or repetition of the scene."""
+    """Scene time at which the faults end, s; default: when the scene ends or repeats."""
 
     @model_validator(mode="after")
     def _end_after_start(self) -> FaultConfig:
@@ -408,7 +408,7 @@ class SceneConfig(Table):
 
 
 def _meet(one: TouchConfig, two: TouchConfig) -> bool:
-    """Return whether two touches or any of their repetitions overlap in time."""
+    """Return whether two touches, including their repetitions, overlap in time."""
     return any(a.from_s < b.to_s and b.from_s < a.to_s for a in one.each for b in two.each)
 
 
@@ -432,7 +432,7 @@ def parse_scene(table: Mapping[str, Any], *, where: str = "") -> SceneConfig:
     """Create a scene from a table with the keys of a scene file.
 
     Args:
-        table: Scene in the form that tomllib returns.
+        table: Scene in the form returned by tomllib.
         where: File name for error messages.
 
     Raises:
@@ -457,7 +457,7 @@ def _require_keys(
     allowed: Mapping[str, tuple[str, ...]],
     required: Mapping[str, tuple[str, ...]],
 ) -> None:
-    """Raise ConfigError if ``value`` forbids a given key or requires a missing one."""
+    """Raise ConfigError if ``value`` forbids a key that is given or requires a key that is missing."""
     for name in sorted({each for keys in allowed.values() for each in keys}):
         given = getattr(table, name)
         if given is not None and name not in allowed[value]:

@@ -22,9 +22,9 @@ DEEPEST: Final = 0.9
 """Maximum depth of a body, relative to the layer thickness or the electrode height, whichever is smaller."""
 APART: Final = 3.0
 """Minimum gap between simultaneous contacts on a patch, as a multiple of the layer thickness or of the larger
-contact's half width, whichever is smaller. Contacts are computed independently of each other. At this gap,
-the neglected displacement is at most 3 % of the depth, for a sphere of radius 40 mm on an incompressible
-layer 2 mm thick."""
+contact's half width, whichever is smaller. Contacts are computed independently of each other. For a sphere of
+radius 40 mm on an incompressible layer 2 mm thick, the displacement neglected at this gap is at most 3 % of
+the depth."""
 
 
 def window_of_touch(
@@ -52,7 +52,7 @@ def window_of_touch(
 
 
 def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
-    """Return the poses of the body during a touch and its repetitions, by number of the time step.
+    """Return the poses of the body during a touch and its repetitions, by time step number.
 
     While the body is at rest, all time steps have the same pose, so a long touch costs little.
     """

@@ -19,8 +19,8 @@ class BodyContact:
         centre_m: (2,) centre of pressure in the patch frame, metres.
         area_m2: Area of contact, m².
         depth_m: Depth of the body's lowest point below the undeformed surface, metres.
-        force_n: (3,) force on the skin in the patch frame, N. The z component is negative: it points into the
-            skin.
+        force_n: (3,) force on the skin in the patch frame, N. The z component is negative because the force
+            points into the skin.
         origin_m: (2,) centre of the first cell, metres.
         cell_m: Side length of a cell, metres.
         traction_pa: (3, X, Y) tractions on the skin (force per area) in the patch frame, Pa. The last two
@@ -38,7 +38,7 @@ class BodyContact:
 
     @property
     def radius_m(self) -> float:
-        """Radius of a circle with the area of the contact, metres."""
+        """Radius of a circle that has the same area as the contact, metres."""
         return math.sqrt(self.area_m2 / math.pi)
 
     @property
@@ -60,7 +60,7 @@ class PatchTruth:
     Attributes:
         t_s: Scene time, s.
         displacement_m: (U, N, 3) displacement of the upper electrodes, metres.
-        contacts: Contacts, in the order of touches in the scene.
+        contacts: Contacts, in the order of the touches in the scene.
         wrench: (6,) force on the patch (N), and moment about the origin of the patch frame (N m).
     """
 

@@ -16,24 +16,24 @@ from vcan_sim.contact.solve import press
 from vcan_sim.scenes.shapes import Float, Shape
 
 MOST_CELLS: Final = 1.4
-"""Approximate maximum number of cells in a window, as a multiple of n², for n cells requested across the
-narrow side. Elongated windows have larger cells, up to twice the size."""
+"""Approximate maximum number of cells in a window, as a multiple of n², where n is the number of cells
+requested across the narrow side. Elongated windows have larger cells, up to twice the size."""
 MARGIN: Final = 0.1
-"""Margin of the window around the deepest contact, relative to the half width of the contact. The minimum is
+"""Margin of the window around the deepest contact, relative to the contact's half width. The minimum is
 ``MARGIN_CELLS`` cells."""
 FRICTION_MARGIN: Final = 0.15
-"""Additional margin per unit of the friction coefficient. A sliding body piles up the skin in front of it."""
+"""Additional margin per unit of the friction coefficient. A sliding body piles up the skin ahead of it."""
 MARGIN_CELLS: Final = 2
 CLOSE: Final = 3e-4
 """Tolerance of the contact solver (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
 FORCE_CLOSE: Final = 2e-3
-"""Relative tolerance of the normal force of a force-controlled touch."""
+"""Relative tolerance on the normal force of a force-controlled touch."""
 _TURNS: Final = 12
 """Maximum number of window sizes tried for one contact."""
 _SEARCHES: Final = 40
 """Maximum number of depths tried in a search for a given force."""
 _NOWHERE_M: Final = -1.0
-"""Lower limit of the overlap, metres. Points outside the body are given this value."""
+"""Lower limit of the overlap, metres. Points outside the body have this value."""
 
 
 class TooMuch(ValueError):
@@ -49,7 +49,7 @@ class Window:
     """Window of grid cells under a body.
 
     Attributes:
-        grid: Grid of the cells, with their elastic response.
+        grid: Grid of cells and their elastic response.
         half_m: Half widths of the deepest contact along x and y, metres.
         deepest_m: Depth of the deepest contact, metres, computed without friction.
         force_n: Normal force of the deepest contact, N, computed without friction.
@@ -106,7 +106,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
         margin: Margin around the frictionless contact, relative to its half width.
 
     Raises:
-        TooMuch: If the force requires a depth larger than ``most_m``.
+        TooMuch: If the force requires a depth greater than ``most_m``.
     """
     if not by_force:
         return _fit(layer, body.shape, yaws_rad, level, cells, margin)
@@ -144,13 +144,14 @@ def solve_depth(
     """Find the depth at which the contact force reaches a target.
 
     Force is nearly a power of depth, so the search is a bracketed secant method in the logarithms of both.
-    With few cells in contact, the power law fails; every second step therefore bisects the bracket.
+    The power law fails if few cells are in contact, so every second step bisects the bracket.
 
     Args:
-        force_n: Function from depth (m) to force (N). The last call uses the returned depth.
+        force_n: Function that returns the force (N) at a given depth (m). Its last call is made at the
+            returned depth.
         target_n: Target force, N, positive.
-        known: Known depth (m) and force (N). The first trial depth follows from them with F ∝ δ^1.5.
-        close: Tolerance of the force, relative to the target.
+        known: Known depth (m) and force (N). The first trial depth is derived from them, assuming F ∝ δ^1.5.
+        close: Tolerance on the force, relative to the target.
 
     Raises:
         ArithmeticError: If the search does not converge.
@@ -166,7 +167,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # the remaining difference is the error of the contact solver
+        if high - low < 0.1 * close * high:  # the rest is within the error of the contact solver
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:
@@ -231,7 +232,7 @@ def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
 
 
 def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
-    """Return upper bounds (2,) of the half width (m) of a body along x and y, at a given depth."""
+    """Return upper bounds (2,) on the half widths (m) of a body along x and y at a given depth."""
     reach = 1e-5
     for _ in range(20):
         line = np.linspace(-reach, reach, 65)

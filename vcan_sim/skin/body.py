@@ -13,14 +13,14 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.skin.imperfections import Imperfections
 
 CLIPPED_AT: Final = 3.0
-"""Limit at which normal draws are clipped, in standard deviations."""
+"""Limit at which draws from a normal distribution are clipped, in standard deviations."""
 _LEAST_LEFT: Final = 0.1
 """Minimum gap between an upper electrode and its nearest lower electrode, relative to the nominal gap."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Actual positions of the electrodes of a patch at rest."""
+    """Actual positions of a patch's electrodes at rest."""
 
     upper_m: Float
     """(U, N, 3) float64, m: upper electrodes."""
@@ -29,10 +29,10 @@ class Body:
 
 
 class Draws:
-    """Random draws of one patch, with an independent stream for each imperfection.
+    """Random draws for one patch, with an independent stream for each imperfection.
 
     Args:
-        seed: Seed of the imperfections.
+        seed: Random seed for the imperfections.
         number: Number of the patch in the hand.
     """
 
@@ -40,17 +40,17 @@ class Draws:
         self._seed, self._number = seed, number
 
     def stream(self, name: str, *more: int) -> np.random.Generator:
-        """Return the random generator of an imperfection. Different ``more`` give independent generators."""
+        """Return the random generator for an imperfection; each value of ``more`` has its own generator."""
         return np.random.default_rng([self._seed, self._number, *name.encode(), *more])
 
     def normal(self, name: str, *shape: int) -> Float:
-        """Return an array of standard normal draws, clipped at :data:`CLIPPED_AT`."""
+        """Return an array of draws from the standard normal distribution, clipped at :data:`CLIPPED_AT`."""
         drawn = self.stream(name).standard_normal(shape)
         return np.asarray(np.clip(drawn, -CLIPPED_AT, CLIPPED_AT))
 
 
 def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Body:
-    """Return the electrode positions of a patch as manufactured.
+    """Return the electrode positions of a patch, including manufacturing errors.
 
     On flat and curved patches alike, thickness and tilt errors move each upper electrode along z by a
     fraction of its height above the nearest lower electrode.
@@ -58,10 +58,10 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
     Args:
         layout: Layout of the patch.
         imperfections: Sizes of the errors.
-        draws: Random draws of the patch.
+        draws: Random draws for the patch.
 
     Returns:
-        Actual electrode positions; the arrays of the layout itself if no imperfection moves the electrodes.
+        Actual electrode positions; the layout's own arrays if no imperfection moves the electrodes.
 
     Raises:
         ConfigError: If the random errors make the gap between an upper and a lower electrode too small.

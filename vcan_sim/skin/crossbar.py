@@ -1,4 +1,4 @@
-"""Read-out of the crossbar: measured resistances, by nodal analysis of the complete network.
+"""Read-out of the crossbar: computes the measured resistances by nodal analysis of the complete network.
 
 A resistive wire is a chain of resistors that starts at the connector, with a node at each electrode. A wire
 without resistance is a single node. C is the matrix of conductances between upper and lower nodes. In series
@@ -26,11 +26,11 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """Upper or lower wires of a crossbar, with their resistances.
+    """Upper or lower wires of a crossbar and their resistances.
 
     Args:
-        series_ohm: (W,) float64, ohm: resistance in series with each wire, of its contact and its multiplexer
-            or amplifier input.
+        series_ohm: (W,) float64, ohm: total resistance of each wire's contact and its multiplexer or
+            amplifier input, in series with the wire.
         wire_ohm: Wire resistance per electrode pitch, ohm; 0 makes each wire a single node.
         electrodes: Number of electrodes per wire.
     """
@@ -46,7 +46,7 @@ class Side:
 
     @property
     def feed_ohm(self) -> Float:
-        """Resistance (W,) in ohm between the source or amplifier and the first node of each wire."""
+        """Resistance (W,) in ohms between the source or amplifier and the first node of each wire."""
         return np.asarray(self.series_ohm + self.wire_ohm)
 
     @property
@@ -55,7 +55,7 @@ class Side:
         return not self.feed_ohm.any()
 
     def first(self) -> Float:
-        """Return the incidence matrix (W · nodes, W): 1 at the first node of each wire, otherwise 0."""
+        """Return the incidence matrix (W · nodes, W): 1 at the first node of each wire, 0 elsewhere."""
         wires = len(self.series_ohm)
         found = np.zeros((wires * self.nodes, wires))
         found[np.arange(wires) * self.nodes, np.arange(wires)] = 1.0
@@ -67,7 +67,7 @@ class Side:
         The first entry of the superdiagonal is unused.
 
         Args:
-            sums: (n,) float64, S: conductances of the paths at each node.
+            sums: (n,) float64, S: total conductance of the paths at each node.
             feed: (W,) float64, S: conductances of the connectors.
         """
         wires = len(self.series_ohm)
@@ -82,10 +82,10 @@ class Side:
 
 
 def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohm that the read-out ``grounded`` measures.
+    """Return the resistances (U, K) in ohms that the read-out ``grounded`` measures.
 
     Upper wires are driven one at a time, with all others grounded. A reading is the driving voltage divided
-    by the current into the amplifier of a lower wire. Without series and wire resistances, it is the
+    by the current into the amplifier of a lower wire. Without series and wire resistances, a reading is the
     resistance of the crossing.
 
     Args:
@@ -94,7 +94,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
         lower: Lower wires.
     """
     above, below = conductance.sum(axis=1), conductance.sum(axis=0)
-    if lower.ideal:  # with all lower wires grounded, upper wires are independent
+    if lower.ideal:  # upper wires are independent if all lower wires are grounded
         return np.asarray(1.0 / (_driven(above, upper).T @ conductance))
     feed = 1.0 / lower.feed_ohm
     if upper.ideal:
@@ -108,7 +108,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohm that the read-out ``floating`` measures.
+    """Return the resistances (U, K) in ohms that the read-out ``floating`` measures.
 
     One pair of wires is measured while all other wires float. A reading is the effective resistance between
     two nodes, Z_uu + Z_kk − 2 Z_uk, plus the series resistances of the two wires. Z is the inverse of the
@@ -124,8 +124,8 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     solved = _tridiagonal(lower.diagonals(below, 0.0), np.hstack([conductance.T, ends]))
     across, own = np.split(solved, [len(above)], axis=1)
     schur = _dense(upper.diagonals(above, 0.0)) - conductance @ across
-    # The matrix of a floating network is singular. A constant added to all of its elements fixes the mean of
-    # v and changes no voltage difference.
+    # The matrix of a floating network is singular. Adding a constant to all of its elements fixes the mean of
+    # v without changing any voltage difference.
     schur += above.mean()
     z = np.linalg.inv(schur)
     between = across[:: lower.nodes] @ z  # (K, upper nodes): Z_lu

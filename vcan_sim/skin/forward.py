@@ -1,11 +1,11 @@
 """Conductances between the electrodes of a patch.
 
-An exact patch has point electrodes. The path between two of them at distance d has the conductance 1 / (ρ d),
-which has the form of the potential of a point charge. :class:`ExactForward` sums these conductances directly.
-:class:`Paths` adds two effects:
+An exact patch has point electrodes. The path between two electrodes at distance d has the conductance
+1 / (ρ d), which has the form of the potential of a point charge. :class:`ExactForward` sums these
+conductances directly. :class:`Paths` adds two effects:
 
 finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
-                    where l₁ and l₂ are the distances to the nearest and the farthest point of its rim
+                    where l₁ and l₂ are the distances to the nearest and farthest points of its rim
                     (Weber 1873; Jackson, Classical Electrodynamics, 3rd ed., problem 3.3). The conductance
                     between two discs averages this potential over a parallel disc with the charge density
                     1/√(a² − r²). Each of the two discs adds (a²/6) ∇²(1/d), where ∇² is the Laplacian in
@@ -28,15 +28,15 @@ from skinnode.model.layout import Float
 
 
 class ExactForward:
-    """Resistances of a patch with point electrodes, by direct summation.
+    """Computes the resistances of a patch with point electrodes by direct summation.
 
     This class shares no code with the solver kernels, so the ground truth and the solvers cannot share a bug.
     For speed, it allocates no temporary arrays of shape (…, 3).
 
     Args:
-        shape: (U, N, K, M): numbers of upper wires, electrodes on each, lower wires, and electrodes on each.
+        shape: (U, N, K, M): U upper wires with N electrodes each, and K lower wires with M electrodes each.
         lower_m: (K, M, 3) float64, m: lower electrodes.
-        resistivity_ohm_per_m: Resistance of a path per metre between its electrodes, ohm/m.
+        resistivity_ohm_per_m: Resistance of a path per metre of distance between its electrodes, ohm/m.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class ExactForward:
         self._resistivity = resistivity_ohm_per_m
 
     def __call__(self, upper_m: Float) -> Float:
-        """Return the resistances (U, K) in ohm for upper electrodes (U, N, 3) in m."""
+        """Return the resistances (U, K) in ohms for upper electrodes at (U, N, 3) in metres."""
         distance = np.zeros((upper_m.size // 3, self._lower.shape[1]))
         for here, there in zip(upper_m.reshape(-1, 3).T, self._lower, strict=True):
             distance += (here[:, None] - there) ** 2
@@ -85,7 +85,7 @@ class Paths:
             axes: Axes of ``shape`` to sum over: 1, 3, both or none.
 
         Returns:
-            (U, N or 1, K, M or 1) float64, 1/m; divide by the resistivity (ohm/m) for siemens.
+            (U, N or 1, K, M or 1) float64, 1/m; divide by the resistivity (ohm/m) to obtain siemens.
         """
         with self._work(upper_m) as work:
             return np.asarray(self._each(upper_m, work).reshape(shape).sum(axis=axes, keepdims=True))
@@ -94,7 +94,7 @@ class Paths:
         return _borrowed((3, upper_m.size // 3, self._lower.shape[1]))
 
     def _each(self, upper_m: Float, work: Float) -> Float:
-        """Return the conductances (U N, K M) of all paths in 1/m, in an array of ``work``."""
+        """Return the conductances (U N, K M) of all paths in 1/m, stored in ``work``."""
         plane, square = self._squares(upper_m, work)
         found: Float = work[2]
         with np.errstate(divide="ignore"):
@@ -110,7 +110,7 @@ class Paths:
         return found
 
     def _squares(self, upper_m: Float, work: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in the plane and in space, m², in arrays of ``work``."""
+        """Return the squared distances (U N, K M) in the plane and in space, in m², stored in ``work``."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
         plane, square, gap = work
         for axis, out in ((0, plane), (1, gap), (2, square)):
@@ -128,7 +128,7 @@ _unused: dict[tuple[int, ...], list[Float]] = {}
 def _borrowed(shape: tuple[int, ...]) -> Iterator[Float]:
     """Lend a work array to one thread at a time; patches of the same shape share the arrays.
 
-    The arrays are reused, because mapping the pages of new ones would take longer than the arithmetic.
+    The arrays are reused because mapping the pages of new arrays would take longer than the arithmetic.
     """
     unused = _unused.setdefault(shape, [])
     try:

@@ -18,13 +18,13 @@ FULL_SCALE: Final = 2.0
 class FrontEnd:
     """Amplifier and converter of one patch.
 
-    The amplifier is balanced at rest, so its gain error acts on changes in resistance. A gain error of the
+    The amplifier is balanced at rest, so its gain error acts on changes in resistance. A gain error on the
     whole reading would cancel out, because nodes send R divided by the baseline R0.
 
     Args:
         imperfections: Sizes of the errors.
-        draws: Random draws of the patch.
-        rest_ohm: (U, K) float64, ohm: resistances at rest at the amplifier's input.
+        draws: Random draws for the patch.
+        rest_ohm: (U, K) float64, ohm: resistances at the amplifier's input when the skin is at rest.
     """
 
     def __init__(self, imperfections: Imperfections, draws: Draws, rest_ohm: Float) -> None:
@@ -42,13 +42,13 @@ class FrontEnd:
         self._amplifies = bool(imperfections.gain or imperfections.offset)
 
     def amplified_ohm(self, ohm: Float) -> Float:
-        """Return the amplifier output (U, K) in ohm, with gain and offset errors."""
+        """Return the amplifier output (U, K) in ohms, with gain and offset errors."""
         if not self._amplifies:
             return ohm
         return np.asarray(ohm + self._gain * (ohm - self._rest_ohm) + self._offset_ohm)
 
     def converted_ohm(self, ohm: Float, reading: int) -> Float:
-        """Return the converter output (U, K) in ohm, with noise and rounding.
+        """Return the converter output (U, K) in ohms, with noise and rounding.
 
         Args:
             ohm: (U, K) float64, ohm: converter input.

@@ -11,8 +11,8 @@ creep        d = s + c₁ q₁ + c₂ q₂, where τᵢ dqᵢ/dt = s − qᵢ. T
              1976, section 5.5). The response to a step s is s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
 
 The result is the true displacement of the electrodes. The state advances from time 0 in steps of
-:data:`STEP_S`, within which the output of the hysteresis model is taken as linear. A time between two steps
-is reached by a partial step that is not stored, so results do not depend on the times requested earlier.
+:data:`STEP_S`. Within a step, the output of the hysteresis model is assumed to vary linearly. A time between
+two steps is reached by a partial step that is not stored, so results do not depend on earlier requests.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ older state is kept."""
 _THINNED: Final = 64
 
 Load = Callable[[float], "Float | None"]
-"""Function from time (s) to the displacement (U, N, 3) in m, without hysteresis and creep; None at rest."""
+"""Function that maps time (s) to the displacement (U, N, 3) in metres, without hysteresis and creep. It
+returns None at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """State of the rubber at one instant, m, for each coordinate (U, N, 3) of the displacement."""
+    """State of the rubber at one instant, in metres, for each coordinate (U, N, 3) of the displacement."""
 
     play: Float
     """(P, U, N, 3): outputs of the play operators."""
@@ -73,10 +74,10 @@ class History:
         self._load: Load | None = None
         self._kept: dict[int, State | None] = {}
         self._recent: OrderedDict[int, State | None] = OrderedDict()
-        self._lock = threading.Lock()  # the node reads in one thread while another requests the truth
+        self._lock = threading.Lock()  # one thread reads for the node; another requests the ground truth
 
     def displacement_m(self, t_s: float, load: Load) -> Float | None:
-        """Return the displacement (U, N, 3) in m at ``t_s``; None before the first load.
+        """Return the displacement (U, N, 3) in metres at ``t_s``; None before the first load.
 
         Args:
             t_s: Time since the start of the history, s.

@@ -1,4 +1,4 @@
-"""Sizes of the imperfections of a simulated patch."""
+"""Sizes of a simulated patch's imperfections."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _OF_NETWORK: Final = (
     "multiplexer_ohm",
     "virtual_ground_ohm",
 )
-"""Resistances that only the read-outs ``grounded`` and ``floating`` model."""
+"""Resistances modelled only by the read-outs ``grounded`` and ``floating``."""
 _WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
 """Fields that are not sizes. They have no effect if every size is zero."""
 _BITS: Final = (8, 32)
@@ -50,50 +50,49 @@ _BITS: Final = (8, 32)
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """Sizes of the deviations of a simulated patch from its layout. The default is an exact patch.
+    """Sizes of a simulated patch's deviations from its layout. The default is an exact patch.
 
     A size marked *drawn* is the standard deviation of a normal distribution that is clipped at three standard
-    deviations. Each imperfection has its own random stream, so enabling one does not change the draws of the
-    others.
+    deviations. Each imperfection has its own random stream, so enabling one imperfection does not change the
+    draws for the others.
 
     Raises:
-        ConfigError: If a value has the wrong type or is out of range, or the read-out ``ideal`` is combined
-            with a nonzero network resistance.
+        ConfigError: If a value has the wrong type or is out of range, or if the read-out ``ideal`` is
+            combined with a nonzero network resistance.
     """
 
     seed: int = 1
-    """Random seed of the imperfections. The patches of a hand share the seed but have different random
+    """Random seed for the imperfections. The patches of a hand share the seed but have different random
     draws."""
 
     # --- geometry
     placement: float = 0.0
-    """Position error of each upper and lower wire along x, y and z, pitches; drawn."""
+    """Position error of each upper and lower wire along x, y and z, in pitches; drawn."""
     along: float = 0.0
-    """Position error of each electrode along its wire, pitches; drawn."""
+    """Position error of each electrode along its wire, in pitches; drawn."""
     thickness: float = 0.0
     """Thickness error of the rubber, as a fraction of the clearance between the layers; drawn."""
     tilt: float = 0.0
     """Rise of the upper layer from the middle of the patch to its edge, along x and along y, as a fraction of
     the clearance between the layers; drawn."""
     electrode_radius: float = 0.0
-    """Radius of the electrodes, which are conducting discs parallel to the x-y plane, pitches."""
+    """Radius in pitches of the electrodes, which are conducting discs parallel to the x-y plane."""
 
     # --- rubber
     strain: float = 0.0
     """Relative change in resistivity per unit strain of a path between two electrodes."""
     warming_k: float = 0.0
-    """Final temperature rise, K. It is approached exponentially from the start of the scene."""
+    """Final temperature rise, K. The temperature approaches it exponentially from the start of the scene."""
     temperature_per_k: float = 2e-3
     """Relative change in resistivity per kelvin. It has no effect if ``warming_k`` is 0."""
     warming_s: float = 300.0
     """Time constant of the temperature rise, s."""
     creep: tuple[float, float] = (0.0, 0.0)
-    """Delayed displacements of the fast and the slow creep term, as fractions of the immediate
-    displacement."""
+    """Delayed displacements of the fast and slow creep terms, as fractions of the immediate displacement."""
     creep_s: tuple[float, float] = (0.3, 10.0)
-    """Time constants of the fast and the slow creep term, s."""
+    """Time constants of the fast and slow creep terms, s."""
     hysteresis: float = 0.0
-    """Fraction of the displacement that is subject to hysteresis (play operators)."""
+    """Fraction of the displacement that is subject to hysteresis, modelled by play operators."""
 
     # --- read-out
     gain: float = 0.0
@@ -110,9 +109,11 @@ class Imperfections:
     """Mean contact resistance at the connector of each wire, ohm. Each wire's resistance is drawn uniformly
     from 0.5 to 1.5 times the mean."""
     upper_wire_ohm: float = 0.0
-    """Resistance of an upper wire per electrode pitch, and from the connector to the first electrode, ohm."""
+    """Resistance of an upper wire per electrode pitch, ohm. The section from the connector to the first
+    electrode has the same resistance."""
     lower_wire_ohm: float = 0.0
-    """Resistance of a lower wire per electrode pitch, and from the connector to the first electrode, ohm."""
+    """Resistance of a lower wire per electrode pitch, ohm. The section from the connector to the first
+    electrode has the same resistance."""
     multiplexer_ohm: float = 0.0
     """On-resistance of the multiplexer at each upper wire, ohm."""
     virtual_ground_ohm: float = 0.0
@@ -120,8 +121,8 @@ class Imperfections:
     row_time_s: float = 0.0
     """Time between the samples of neighbouring upper wires, s."""
     noise: float = 0.0
-    """Standard deviation of the converter's noise, as a fraction of its full scale. This noise adds to the
-    scene's noise, which is relative to the reading."""
+    """Standard deviation of the converter's noise, as a fraction of its full scale. This noise is added to
+    the scene's noise, which is relative to the reading."""
     bits: int = 0
     """Resolution of the converter, 8 to 32 bits; 0 for no rounding."""
 
@@ -151,9 +152,9 @@ class Imperfections:
     def ordinary(cls, seed: int = 1) -> Self:
         """Return the imperfections of a carefully manufactured patch (``tolerances = "ordinary"``).
 
-        Gain, placement, thickness and electrode radius are those of
-        :data:`skinnode.model.tolerances.ORDINARY`. The other sizes are assumptions. Temperature is constant
-        and the read-out is ideal, because the tolerances cover neither.
+        Gain, placement, thickness and electrode radius are taken from
+        :data:`skinnode.model.tolerances.ORDINARY`. The other sizes are assumptions. The temperature is
+        constant and the read-out is ideal, because the tolerances cover neither.
 
         Args:
             seed: Random seed.
@@ -226,7 +227,7 @@ class Imperfections:
 
 
 def _value(text: str) -> int | float | str:
-    """Return a string as a number if it is one; otherwise, return the string itself."""
+    """Convert a string to a number if possible; otherwise, return the string itself."""
     for kind in (int, float):
         try:
             return kind(text)

@@ -17,28 +17,29 @@ from vcan_sim.skin.hysteresis_and_creep import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
-"""Longest interval over which the motion of the electrodes during a scan is taken as linear, s."""
+"""Longest interval over which the motion of the electrodes during a scan is assumed to be linear, s."""
 
 Surface = Callable[[float], Float]
-"""Function from time (s) to the positions (U, N, 3) of an exact patch's upper electrodes (m). At rest, it
-returns the array ``layout.upper_m`` itself. An example is :meth:`vcan_sim.default_scene.Scene.upper_m`."""
+"""Function that maps time (s) to the positions (U, N, 3) of an exact patch's upper electrodes in metres. At
+rest, it returns the array ``layout.upper_m`` itself. An example is
+:meth:`vcan_sim.default_scene.Scene.upper_m`."""
 
 
 class PhysicalPatch:
-    """Patch with imperfections, and its read-out.
+    """Patch with imperfections and a read-out.
 
     Hysteresis and creep change the displacement of an electrode; placement errors do not. Results depend
     only on time, not on earlier calls. Without imperfections, the resistances equal those of
     :class:`ExactForward` bit for bit.
 
-    The read-outs ``grounded`` and ``floating`` are simplified: the paths of each upper wire have their
-    conductances at the sampling time of that wire, even while another upper wire is sampled. Only sneak
-    currents are affected.
+    The read-outs ``grounded`` and ``floating`` are simplified: the conductances of each upper wire's paths
+    are taken at the sampling time of that wire, even while another upper wire is sampled. This affects only
+    sneak currents.
 
     Args:
         layout: Nominal layout of the patch, as in the hand file.
         imperfections: Deviations from the layout.
-        number: Number of the patch in the hand, which selects its random draws.
+        number: Number of the patch in the hand. It selects the random draws.
 
     Raises:
         ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
@@ -97,7 +98,7 @@ class PhysicalPatch:
         return np.asarray((1.0 - share) * every[span, wires] + share * every[span + 1, wires])
 
     def analogue_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) in ohm at the input of the converter.
+        """Return the resistances (U, K) in ohms at the input of the converter.
 
         Args:
             t_s: Scene time of the scan, s.
@@ -121,7 +122,7 @@ class PhysicalPatch:
         return self._front_end.converted_ohm(analogue_ohm, reading)
 
     def resistance_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) in ohm at the output of the converter, for one scan.
+        """Return the resistances (U, K) in ohms at the output of the converter, for one scan.
 
         The scene time, in whole nanoseconds, seeds the noise.
 
@@ -132,7 +133,7 @@ class PhysicalPatch:
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
 
     def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions (U, N, 3) of the upper electrodes in m; at rest, ``rest_m`` itself."""
+        """Return the upper electrodes' true positions (U, N, 3) in metres; at rest, ``rest_m`` itself."""
         layout_m = self.layout.upper_m
         if self._history is None:
             upper = upper_m_at(t_s)
@@ -143,14 +144,14 @@ class PhysicalPatch:
         return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
 
     def _warmth(self, t_s: float) -> Float:
-        """Return the resistivity (U, 1) relative to time 0, at the sampling time of each upper wire."""
+        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to that at time 0."""
         sizes = self.imperfections
         since_s = np.maximum(t_s + self._row_s, 0.0)
         risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)
         return np.asarray(1.0 + sizes.temperature_per_k * risen_k)[:, None]
 
     def _network(self, draws: Draws) -> tuple[Side, Side]:
-        """Return the upper and the lower wires of the crossbar, with their series resistances."""
+        """Return the upper and lower wires of the crossbar, with their series resistances."""
         sizes = self.imperfections
         upper, per_upper, lower, per_lower = self._electrodes
         contact_ohm = sizes.contact_ohm * draws.stream("contacts").uniform(0.5, 1.5, upper + lower)
@@ -160,11 +161,11 @@ class PhysicalPatch:
         )
 
     def _network_ohm(self, upper_m: Float, warmth: Float) -> Float:
-        """Return the resistances (U, K) in ohm at the amplifier's input.
+        """Return the resistances (U, K) in ohms at the amplifier's input.
 
         Args:
             upper_m: (U, N, 3) float64, m: upper electrodes.
-            warmth: (U, 1) float64: resistivity relative to that of the layout.
+            warmth: (U, 1) float64: resistivity relative to the layout's resistivity.
         """
         if self._pointlike:
             exact_ohm = self._exact(upper_m)
@@ -181,7 +182,7 @@ class PhysicalPatch:
 
 
 class _Motion:
-    """Function from time to the displacement of an exact patch; None at rest.
+    """Function that maps time to the displacement of an exact patch; it returns None at rest.
 
     Motions that wrap the same function are equal, which is how :class:`History` detects a new scene.
     """

@@ -1,13 +1,13 @@
-"""Determines whether and when the frame of a transmission attempt is delivered or destroyed.
+"""Determines whether the frame in a transmission attempt is delivered or destroyed, and when.
 
 :func:`undisturbed` handles the common case, which requires only the number of bits. :func:`disturbed`
 examines the individual bits of the frame.
 
 Error frames follow ISO 11898-1:2015 and Bosch CAN 2.0, part B, sections 3.1.3 and 7. The first station to
-detect an error sends an error flag of 6 bits, starting at the next bit. This flag is an error to the other
-stations, which start their own flags up to 6 bits later. The superposed flags are thus 6 to 12 bits long. An
-error delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags have the nominal bit
-rate. The delay of the second flag is computed at the bit rate of the phase in which the error occurs.
+detect an error sends an error flag of 6 bits, starting at the next bit. The other stations detect this flag
+as an error and start their own flags up to 6 bits later. The superposed flags are thus 6 to 12 bits long. An
+error delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags are sent at the nominal
+bit rate. The delay of the second flag is computed at the bit rate of the phase in which the error occurs.
 
 Simplifications: A disturbance seen by all stations destroys the frame, even if it inverts a recessive bit of
 the arbitration field. Error flags and delimiters are never disturbed. A passive error flag ends when the
@@ -40,7 +40,7 @@ _ACTIVE, _PASSIVE = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class Participant:
-    """Station that takes part in a transmission attempt as sender or receiver."""
+    """Station that takes part in a transmission attempt as a sender or receiver."""
 
     station: int
     passive: bool
@@ -62,7 +62,7 @@ class BitError:
 
 
 class Course(NamedTuple):
-    """Course of a transmission attempt. Times are in ticks from the start of frame."""
+    """Timing and errors of a transmission attempt. Times are in ticks from the start of frame."""
 
     senders: tuple[int, ...]
     """Stations that are still sending when the frame is delivered or destroyed."""
@@ -75,28 +75,28 @@ class Course(NamedTuple):
     error: BitError | None = None
     """Error that destroys the frame; None if the frame is delivered."""
     side_errors: tuple[BitError, ...] = ()
-    """Errors of error-passive stations, which do not destroy the frame, in chronological order."""
+    """Errors at error-passive stations, in chronological order. They do not destroy the frame."""
 
 
 def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: BitRates) -> Course:
     """Return the course of an undisturbed and acknowledged transmission attempt.
 
     Args:
-        senders: stations that send the frame.
-        frame: frame on the bus.
-        esi: whether the senders are error-passive.
-        rates: bit rates of the bus.
+        senders: Stations that send the frame.
+        frame: Frame on the bus.
+        esi: Whether the senders are error-passive.
+        rates: Bit rates of the bus.
     """
     return Course(senders, *undisturbed_times(frame, esi, rates))
 
 
 def undisturbed_times(frame: CanFrame, esi: bool, rates: BitRates) -> tuple[int, int, int]:
-    """Return ``end``, ``recessive`` and ``free`` of :class:`Course` for an undisturbed attempt, ticks.
+    """Return ``end``, ``recessive`` and ``free`` of :class:`Course` for an undisturbed attempt, in ticks.
 
     Args:
-        frame: frame on the bus.
-        esi: whether the senders are error-passive.
-        rates: bit rates of the bus.
+        frame: Frame on the bus.
+        esi: Whether the senders are error-passive.
+        rates: Bit rates of the bus.
     """
     free = rates.ticks(frame_bits(frame, esi))
     end = free - INTERMISSION_BITS * rates.nominal_ticks
@@ -109,10 +109,10 @@ def disturbed(
     """Return the course of a transmission attempt, including any errors.
 
     Args:
-        senders: stations that send frames with identical arbitration fields.
-        receivers: all other stations on the bus.
-        hit: disturbed bit; None if no rule disturbs the attempt.
-        rates: bit rates of the bus.
+        senders: Stations that send frames with identical arbitration fields.
+        receivers: All other stations on the bus.
+        hit: Disturbed bit; None if no rule disturbs the attempt.
+        rates: Bit rates of the bus.
     """
     wires = {each.station: wire_frame(each.frame, each.passive) for each in senders if each.frame}
     bus = _OnBus({each.station: each for each in senders}, {each.station: each for each in receivers}, rates)
@@ -158,11 +158,11 @@ def cut_off(
     """Return the course of a transmission attempt whose only sender leaves the bus during the frame.
 
     Args:
-        frame: frame on the bus.
-        esi: whether the sender is error-passive.
-        bit: position of the last transmitted bit.
-        receivers: all other stations on the bus.
-        rates: bit rates of the bus.
+        frame: Frame on the bus.
+        esi: Whether the sender is error-passive.
+        bit: Position of the last transmitted bit.
+        receivers: All other stations on the bus.
+        rates: Bit rates of the bus.
     """
     wire = wire_frame(frame, esi)
     lag = receiver_lag(wire, bit, wire.bits[bit], _PASSIVE)
@@ -187,7 +187,7 @@ def _destroyed_by_hit(hit: Hit, wire: WireFrame, bus: _OnBus) -> Course:
     flag = _PASSIVE if all(bus.sending[station].passive for station in detecting) else _ACTIVE
     seen = wire.bits[hit.bit] ^ (hit.station == -1)
     lag = receiver_lag(wire, hit.bit, seen, flag) if bus.receiving else 0
-    if hit.station == -1 and lag == 0:  # the disturbed bit is an error to the receivers too
+    if hit.station == -1 and lag == 0:  # the receivers detect the disturbed bit too
         detecting += tuple(bus.receiving)
     error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, bus.rates)
     return _destroyed(error, _lag_ticks(wire, hit.bit, lag, bus.rates), bus)
@@ -233,7 +233,7 @@ def _sender_lag(wire: WireFrame, bit: int) -> int:
 
 
 def _first_difference(streams: Sequence[tuple[int, ...]]) -> int | None:
-    """Return the first bit position at which the bit streams differ, or None."""
+    """Return the first bit position at which the bit streams differ; None if they do not differ."""
     for position, bits in enumerate(zip(*streams, strict=False)):
         if 0 < sum(bits) < len(bits):
             return position

@@ -1,4 +1,4 @@
-"""Bit rates of a bus, and a unit of time, the tick, in which every bit time is a whole number."""
+"""Bit rates of a bus, and the tick, a unit of time in which every bit time is a whole number."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ MAX_DATA_BPS: Final = 8_000_000
 class BitRates:
     """Bit rates of a bus.
 
-    Time is counted in ticks. A tick is the longest unit of which a nanosecond, a nominal bit and a data bit
-    are all whole multiples; it is 1 ns if both bit times are whole nanoseconds. Times in ticks are exact.
-    Only the times reported to callers are rounded, each on its own, so rounding errors do not accumulate.
+    Time is counted in ticks. A nanosecond, a nominal bit time and a data bit time are all whole multiples of
+    a tick, which is the longest unit with this property; it is 1 ns if both bit times are whole nanoseconds.
+    Times in ticks are exact. Only the times reported to callers are rounded, each separately, so rounding
+    errors do not accumulate.
 
     Raises:
-        ConfigError: if a bit rate is out of range.
+        ConfigError: If a bit rate is out of range.
     """
 
     nominal_bps: int = 1_000_000
@@ -56,7 +57,7 @@ class BitRates:
             object.__setattr__(self, name, value)
 
     def ticks(self, bits: tuple[int, int]) -> int:
-        """Return the duration of the given numbers of nominal and data bits, ticks."""
+        """Return the duration in ticks of the given numbers of nominal and data bits."""
         return bits[0] * self.nominal_ticks + bits[1] * self.data_ticks
 
     def ceil_ns(self, ticks: int) -> int:

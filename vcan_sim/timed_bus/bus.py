@@ -53,15 +53,15 @@ from vcan_sim.timed_bus.wire_frame import wire_frame
 
 
 class TimedBus:
-    """CAN bus with its stations. The times of successive calls must not decrease.
+    """CAN bus and its stations. The times passed in successive calls must not decrease.
 
     Args:
-        stations: options of the stations; methods refer to a station by its index in this sequence.
-        rates: bit rates of the bus.
-        disturbances: rules that inject errors.
+        stations: Options of the stations; methods refer to a station by its index in this sequence.
+        rates: Bit rates of the bus.
+        disturbances: Rules that inject errors.
 
     Raises:
-        ConfigError: if a disturbance names a station that does not exist.
+        ConfigError: If a disturbance names a station that does not exist.
     """
 
     def __init__(
@@ -98,17 +98,17 @@ class TimedBus:
         """Queue a frame for transmission.
 
         Args:
-            time_ns: current time, ns.
-            station: index of the sending station.
-            frame: frame to send.
+            time_ns: Current time, ns.
+            station: Index of the sending station.
+            frame: Frame to send.
 
         Returns:
             True if the frame was queued, False if the station's queue is full.
 
         Raises:
-            ValueError: if the time is earlier than in a previous call, or a CAN FD frame is sent on a bus
+            ValueError: If the time is earlier than in a previous call, or if a CAN FD frame is sent on a bus
                 without a data bit rate.
-            IndexError: if the station does not exist.
+            IndexError: If the station does not exist.
         """
         sender = self._at(time_ns, station)
         if frame.fd and self._rates.data_bps is None:
@@ -118,20 +118,20 @@ class TimedBus:
             return False
         self._number += 1
         sender.queue.push(Waiting(arbitration_key(frame), self._number, time_ns, frame))
-        if station not in self._pending:  # otherwise, it takes part in the next arbitration already
+        if station not in self._pending:  # otherwise, it already takes part in the next arbitration
             self._offer(sender)
         return True
 
     def clear(self, time_ns: int, station: int) -> None:
-        """Discard the queued frames of a station. A transmission in progress continues.
+        """Discard a station's queued frames. A transmission in progress continues.
 
         Args:
-            time_ns: current time, ns.
-            station: index of the station.
+            time_ns: Current time, ns.
+            station: Index of the station.
 
         Raises:
-            ValueError: if the time is earlier than in a previous call.
-            IndexError: if the station does not exist.
+            ValueError: If the time is earlier than in a previous call.
+            IndexError: If the station does not exist.
         """
         sender = self._at(time_ns, station)
         sender.queue.clear()
@@ -140,16 +140,16 @@ class TimedBus:
     def disconnect(self, time_ns: int, station: int) -> None:
         """Disconnect a station, but keep its queue.
 
-        If the station is the only sender of a frame that has not been acknowledged yet, the frame ends in an
-        error frame.
+        If the station is the only sender of a frame that has not been acknowledged yet, the frame is cut off
+        by an error frame.
 
         Args:
-            time_ns: current time, ns.
-            station: index of the station.
+            time_ns: Current time, ns.
+            station: Index of the station.
 
         Raises:
-            ValueError: if the time is earlier than in a previous call.
-            IndexError: if the station does not exist.
+            ValueError: If the time is earlier than in a previous call.
+            IndexError: If the station does not exist.
         """
         leaving = self._at(time_ns, station)
         if not leaving.connected:
@@ -166,12 +166,12 @@ class TimedBus:
         """Reconnect a station, and reset both of its error counters to 0.
 
         Args:
-            time_ns: current time, ns.
-            station: index of the station.
+            time_ns: Current time, ns.
+            station: Index of the station.
 
         Raises:
-            ValueError: if the time is earlier than in a previous call.
-            IndexError: if the station does not exist.
+            ValueError: If the time is earlier than in a previous call.
+            IndexError: If the station does not exist.
         """
         joining = self._at(time_ns, station)
         if joining.connected:
@@ -186,15 +186,15 @@ class TimedBus:
         self._offer(joining)
 
     def restart(self, time_ns: int, station: int) -> None:
-        """Start the recovery of a station from bus-off. In any other state, this method does nothing.
+        """Start a station's recovery from bus-off. In any other state, this method does nothing.
 
         Args:
-            time_ns: current time, ns.
-            station: index of the station.
+            time_ns: Current time, ns.
+            station: Index of the station.
 
         Raises:
-            ValueError: if the time is earlier than in a previous call.
-            IndexError: if the station does not exist.
+            ValueError: If the time is earlier than in a previous call.
+            IndexError: If the station does not exist.
         """
         stopped = self._at(time_ns, station)
         if stopped.counters.state is ErrorState.BUS_OFF and stopped.connected:
@@ -206,10 +206,10 @@ class TimedBus:
         """Add a rule that injects errors from the next arbitration onwards.
 
         Args:
-            rule: disturbance rule.
+            rule: Disturbance rule.
 
         Raises:
-            ConfigError: if the rule names a station that does not exist.
+            ConfigError: If the rule names a station that does not exist.
         """
         if rule.station is not None and not 0 <= rule.station < len(self._stations):
             allowed = f"0 to {len(self._stations) - 1}, or None"
@@ -222,10 +222,10 @@ class TimedBus:
         The transmission attempt in progress is not affected.
 
         Args:
-            rule: the object that was passed to :meth:`disturb`.
+            rule: The object that was passed to :meth:`disturb`.
 
         Raises:
-            ValueError: if the rule is not active.
+            ValueError: If the rule is not active.
         """
         self._disturbances.remove(rule)
 
@@ -235,7 +235,7 @@ class TimedBus:
     def next_event_ns(self) -> int | None:
         """Time (ns) at which to call :meth:`advance` next; None if nothing is pending.
 
-        The call may return no events, because some steps of the bus are internal.
+        That call may return an empty list, because some steps of the bus are internal.
         """
         if self._events:
             return self._rates.ceil_ns(self._now)
@@ -245,10 +245,10 @@ class TimedBus:
         """Simulate the bus up to a given time, and return the new events in chronological order.
 
         Args:
-            time_ns: end of the simulated interval, ns.
+            time_ns: End of the simulated interval, ns.
 
         Raises:
-            ValueError: if the time is earlier than in a previous call.
+            ValueError: If the time is earlier than in a previous call.
         """
         self._advance(time_ns)
         events, self._events = self._events, []
@@ -260,7 +260,7 @@ class TimedBus:
         """Return the error counters of a station. They determine its error state.
 
         Args:
-            station: index of the station.
+            station: Index of the station.
         """
         return self._stations[station].counters
 
@@ -268,7 +268,7 @@ class TimedBus:
         """Return the number of unsent frames of a station, including the frame in transmission.
 
         Args:
-            station: index of the station.
+            station: Index of the station.
         """
         sender = self._stations[station]
         return len(sender.queue) + (sender.sending is not None)
@@ -283,18 +283,18 @@ class TimedBus:
 
     @property
     def frames(self) -> Mapping[tuple[int, bool], int]:
-        """Number of delivered frames for each identifier. A key is the pair (identifier, is extended)."""
+        """Numbers of delivered frames, keyed by identifier and whether the identifier is extended."""
         return MappingProxyType(self._frames)
 
     def busy_share(self, from_ns: int, to_ns: int) -> float:
         """Return the bus load: the fraction of time occupied by frames, error frames and intermissions.
 
         Args:
-            from_ns: start of the interval, ns.
-            to_ns: end of the interval, ns; at most the time of the last call.
+            from_ns: Start of the interval, ns.
+            to_ns: End of the interval, ns; at most the time of the last call.
 
         Raises:
-            ValueError: if the interval is empty or ends in the future.
+            ValueError: If the interval is empty or ends in the future.
         """
         if not from_ns < to_ns <= self._rates.ceil_ns(self._now):
             now_ns = self._rates.ceil_ns(self._now)
@@ -310,7 +310,8 @@ class TimedBus:
         """Discard the record of the bus load before a given time, to free memory.
 
         Args:
-            before_ns: start of the remaining record, ns. :meth:`busy_share` must not look further back.
+            before_ns: Start of the remaining record, ns. Later calls of :meth:`busy_share` must not refer to
+                earlier times.
         """
         self._occupancy.forget(before_ns)
 
@@ -337,10 +338,10 @@ class TimedBus:
     def _deliver_burst(self, until: int) -> bool:
         """Deliver a run of frames from one sender while no other station can interfere.
 
-        This is a fast path. The result is that of :meth:`_step`, in about a third of the time.
+        This is a fast path: it gives the same result as :meth:`_step` in about a third of the time.
 
         Args:
-            until: end of the simulated interval, ticks.
+            until: End of the simulated interval, ticks.
 
         Returns:
             False if another station could interfere. In that case, nothing has been delivered.
@@ -582,7 +583,7 @@ class TimedBus:
                 self._set_counters(now, station, reception_failed(station.counters))
 
     def _still_receiving(self, flight: Flight) -> tuple[int, ...]:
-        """Return the connected stations that have detected no error in the frame so far."""
+        """Return the connected stations that have so far detected no error in the frame."""
         receivers, side_errors = flight.receivers, flight.course.side_errors
         if not side_errors and self._receivers.get(flight.senders) is receivers:
             return receivers
@@ -598,7 +599,7 @@ class TimedBus:
         self._choose_start(now)
 
     def _return(self, station: Station) -> None:
-        """Put the interrupted frame of a station back into its queue."""
+        """Put a station's interrupted frame back into its queue."""
         if station.sending is not None:
             station.queue.put_back(station.sending)
             station.sending = None
@@ -667,7 +668,7 @@ class TimedBus:
             self._recovering.append(station)
 
     def _runs(self, station: Station, until: int) -> int:
-        """Return the number of complete recessive runs that a recovering station has seen until ``until``."""
+        """Return the number of complete recessive runs seen by a recovering station before ``until``."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)

@@ -1,6 +1,6 @@
 """Fault confinement: error counters and error states of a station (ISO 11898-1:2015).
 
-Rule numbers are those of Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3 are absent,
+Rule numbers refer to Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3 are omitted,
 because the simulated bus has no disturbed error flags and no stuff errors during arbitration.
 """
 
@@ -17,7 +17,7 @@ BUS_OFF_FROM: Final = 256
 """Bus-off limit: at this value of its transmit error counter, a station goes bus-off."""
 
 MAX_RECEIVE_ERRORS: Final = 255
-"""Upper limit of the receive error counter. The standard sets none; controllers have 7-bit or 8-bit
+"""Upper limit of the receive error counter. The standard sets no limit; controllers have 7-bit or 8-bit
 counters."""
 
 _BACK_TO_ACTIVE: Final = 119
@@ -28,7 +28,7 @@ RECOVERY_RUNS: Final = 128
 """Number of recessive runs after which a station recovers from bus-off."""
 
 RECOVERY_RUN_BITS: Final = 11
-"""Length of a recessive run that counts towards recovery from bus-off, bits."""
+"""Length in bits of a recessive run that counts towards recovery from bus-off."""
 
 SUSPEND_BITS: Final = 8
 """Suspend transmission: extra time that an error-passive station waits after its own frame, bits."""
@@ -69,8 +69,8 @@ def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Coun
     """Return the error counters of a transmitter after it sends an error flag (rule 3).
 
     Args:
-        counters: error counters before the error.
-        unanswered: whether the frame is not acknowledged and no station sends a dominant bit during the error
+        counters: Error counters before the error.
+        unanswered: Whether the frame is not acknowledged and no station sends a dominant bit during the error
             flag. An error-passive transmitter does not count this error.
 
     Returns:
@@ -85,8 +85,8 @@ def reception_failed(counters: Counters, *, first: bool = False) -> Counters:
     """Return the error counters of a receiver after it detects an error (rules 1 and 2).
 
     Args:
-        counters: error counters before the error.
-        first: whether the receiver is the first station to detect the error. It then sees a dominant bit
+        counters: Error counters before the error.
+        first: Whether the receiver is the first station to detect the error. It then sees a dominant bit
             after its own error flag.
 
     Returns:

@@ -20,17 +20,17 @@ class NthFrame:
     """Rule that disturbs a run of consecutive attempts to send frames with a given identifier.
 
     Raises:
-        ConfigError: if a number is out of range.
+        ConfigError: If a number is out of range.
     """
 
     can_id: int
     first: int
-    """Number of the first disturbed attempt, from 1."""
+    """Number of the first disturbed attempt, counted from 1."""
     attempts: int = 1
     """Number of disturbed attempts."""
     bit: int = 20
-    """Position of the disturbed bit, counting stuff bits; the start of frame is 0. Larger values are
-    clipped to the second-to-last bit of the end of frame."""
+    """Position of the disturbed bit, counting stuff bits; the start of frame is bit 0. Positions beyond the
+    second-to-last bit of the end of frame are clipped to that bit."""
     extended: bool = False
     station: int | None = None
     """Station that sees the disturbance; None for all stations."""
@@ -46,7 +46,7 @@ class RandomShare:
     """Rule that disturbs each transmission attempt with a given probability.
 
     Raises:
-        ConfigError: if ``share`` is not a probability, or ``bit`` is negative.
+        ConfigError: If ``share`` is not a probability, or if ``bit`` is negative.
     """
 
     share: float
@@ -72,7 +72,7 @@ class AtTime:
     """Rule that disturbs the bit sent at a given time. It has no effect on an idle bus.
 
     Raises:
-        ConfigError: if the time is negative.
+        ConfigError: If the time is negative.
     """
 
     time_ns: int
@@ -94,7 +94,7 @@ class Attempt(NamedTuple):
     n_bits: Callable[[], int]
     """Function that returns the number of bits in the frame that can be disturbed."""
     bit_at: Callable[[int], int | None]
-    """Function from a time (ns) to the position of the bit sent at that time; None outside the frame."""
+    """Function that returns the position of the bit sent at a given time (ns); None outside the frame."""
 
 
 class Hit(NamedTuple):
@@ -112,7 +112,7 @@ class Disturbances:
     """Active disturbance rules.
 
     Args:
-        rules: initial disturbance rules.
+        rules: Initial disturbance rules.
     """
 
     def __init__(self, rules: Sequence[Disturbance] = ()) -> None:
@@ -127,7 +127,7 @@ class Disturbances:
         """Add a rule. It counts transmission attempts from now on.
 
         Args:
-            rule: disturbance rule to add.
+            rule: Disturbance rule to add.
         """
         station = -1 if rule.station is None else rule.station
         self._rules.append((rule, station, _compiled(rule)))
@@ -136,10 +136,10 @@ class Disturbances:
         """Remove a rule.
 
         Args:
-            rule: the object that was passed to :meth:`add`.
+            rule: The object that was passed to :meth:`add`.
 
         Raises:
-            ValueError: if the rule is not active.
+            ValueError: If the rule is not active.
         """
         kept = [each for each in self._rules if each[0] is not rule]
         if len(kept) == len(self._rules):
@@ -147,12 +147,12 @@ class Disturbances:
         self._rules = kept
 
     def hit(self, attempt: Attempt) -> Hit | None:
-        """Return the first disturbed bit of a transmission attempt, or None.
+        """Return the first disturbed bit of a transmission attempt; None if no bit is disturbed.
 
-        Call this method exactly once per attempt: rules count the calls.
+        Call this method exactly once per attempt, because rules count the calls.
 
         Args:
-            attempt: transmission attempt to check.
+            attempt: Transmission attempt to check.
         """
         hits = []
         for _, station, rule in self._rules:

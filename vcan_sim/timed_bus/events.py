@@ -47,12 +47,12 @@ class ErrorFrame(NamedTuple):
     frames: tuple[CanFrame, ...]
     """Frame on the bus, or the colliding frames in the order of ``stations``."""
     bit: int
-    """Position of the bit in which the error was detected; the start of frame is 0."""
+    """Position of the bit in which the error was detected; the start of frame is bit 0."""
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detected the error in this bit. The others detect the error flag."""
+    """Stations that detected the error in this bit. The other stations detect the error flag."""
     destroyed: bool
-    """Whether the error flag destroyed the frame. Passive error flags of receivers do not."""
+    """Whether the error flag destroyed the frame. Passive error flags from receivers do not."""
 
 
 class CountersChanged(NamedTuple):

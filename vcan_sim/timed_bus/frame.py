@@ -23,13 +23,13 @@ class _Fields(NamedTuple):
 
 
 class CanFrame(_Fields):
-    """Data frame or remote frame, classic CAN or CAN FD.
+    """Data frame or remote frame of classic CAN or CAN FD.
 
     The error state indicator (ESI) of a CAN FD frame is not included, because the controller sets it:
-    dominant in an error-active station, recessive in an error-passive one.
+    dominant in an error-active station, recessive in an error-passive station.
 
     Args:
-        can_id: Identifier of 11 bits, or of 29 bits if ``extended``.
+        can_id: Identifier with 11 bits, or with 29 bits if ``extended``.
         data: Data: 0 to 8 bytes, or 12, 16, 20, 24, 32, 48 or 64 bytes in CAN FD; empty in a remote frame.
         extended: Whether the identifier has 29 bits.
         remote: Whether the frame is a remote frame.
@@ -38,7 +38,7 @@ class CanFrame(_Fields):
         brs: Whether a CAN FD frame switches to the data bit rate.
 
     Raises:
-        ValueError: if the identifier, the length or the combination of flags is not valid.
+        ValueError: If the identifier, the length or the combination of flags is not valid.
     """
 
     __slots__ = ()
@@ -84,11 +84,11 @@ def arbitration_key(frame: CanFrame) -> int:
     """Return the arbitration field as a number. The frame with the lowest number wins arbitration.
 
     The bits are in transmission order: base identifier, RTR or SRR, IDE, identifier extension, RTR
-    (ISO 11898-1:2015). Dominant bits are 0. A base frame has zeros in place of the extension: an extended
-    frame with the same base identifier has already lost at SRR or IDE.
+    (ISO 11898-1:2015). Dominant bits are 0. A base frame has zeros in place of the extension, because an
+    extended frame with the same base identifier has already lost at SRR or IDE.
 
     Args:
-        frame: frame to send.
+        frame: Frame to send.
 
     Returns:
         32-bit number.
@@ -103,13 +103,13 @@ def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
     """Return the exact number of bits from the start of frame to the end of the intermission.
 
     Args:
-        frame: frame to measure.
-        esi: whether the error state indicator of a CAN FD frame is recessive.
+        frame: Frame to measure.
+        esi: Whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
-        Number of bits at the nominal bit rate, and number at the data bit rate. The bit rate actually changes
-        at the sample points of BRS and the CRC delimiter. Counting BRS as a nominal bit and the CRC delimiter
-        as a data bit gives the same total duration.
+        Number of bits at the nominal bit rate, and number of bits at the data bit rate. The bit rate actually
+        changes at the sample points of BRS and the CRC delimiter. Counting BRS as a nominal bit and the CRC
+        delimiter as a data bit gives the same total duration.
     """
     if frame.fd:
         return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)

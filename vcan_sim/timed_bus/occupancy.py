@@ -1,4 +1,4 @@
-"""Busy intervals of a bus, from which the bus load follows."""
+"""Busy intervals of a bus, from which the bus load is computed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Occupancy:
         self._busy_before = array("q")
 
     def add(self, start_ns: int, end_ns: int) -> None:
-        """Add a busy interval. It must not start before the end of the last one.
+        """Add a busy interval. It must not start before the end of the last interval.
 
         Args:
-            start_ns: start of the interval, ns.
-            end_ns: end of the interval, ns.
+            start_ns: Start of the interval, ns.
+            end_ns: End of the interval, ns.
         """
         ends = self._ends
         if ends and ends[-1] == start_ns:
@@ -39,7 +39,7 @@ class Occupancy:
         self._ends[-1] = end_ns
 
     def busy_ns(self, from_ns: int, to_ns: int) -> int:
-        """Return the busy time between two times, ns."""
+        """Return the busy time (ns) between two times."""
         return self._busy_until(to_ns) - self._busy_until(from_ns)
 
     def forget(self, before_ns: int) -> None:

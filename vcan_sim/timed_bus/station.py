@@ -19,16 +19,16 @@ class StationOptions:
     """Options of a station's CAN controller.
 
     Raises:
-        ConfigError: if an option is not valid.
+        ConfigError: If an option is not valid.
     """
 
     queue: Literal["fifo", "priority"] = "fifo"
     """Transmission order: ``fifo`` is first in, first out, as in SocketCAN; ``priority`` is highest priority
     first."""
     capacity: int | None = None
-    """Maximum number of queued frames, including the one in transmission; None for no limit."""
+    """Maximum number of queued frames, including the frame in transmission; None for no limit."""
     restart_ns: int | None = 0
-    """Delay from bus-off to the start of the recovery, ns; None to wait for a call to
+    """Delay from bus-off to the start of recovery, ns; None to wait for a call to
     :meth:`vcan_sim.timed_bus.bus.TimedBus.restart`."""
 
     def __post_init__(self) -> None:

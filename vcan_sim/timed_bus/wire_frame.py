@@ -1,4 +1,4 @@
-"""Bit sequences of CAN frames, for errors in individual bits (ISO 11898-1:2015).
+"""Bit sequences of CAN frames, used to model errors in individual bits (ISO 11898-1:2015).
 
 Building a bit sequence is slow. :mod:`vcan_sim.timed_bus.bus` does so only if a rule disturbs the frame, no
 station acknowledges it, or two stations send the same identifier.
@@ -14,10 +14,10 @@ from skinnode.canopen.data_length import FD_LENGTHS
 from vcan_sim.timed_bus.frame import CanFrame
 
 FLAG_BITS: Final = 6
-"""Length of the error flag of one station, bits. A run of this many equal bits violates the stuff rule."""
+"""Length of one station's error flag, bits. A run of this many equal bits violates the stuff rule."""
 
 ACK_TO_END_BITS: Final = 9
-"""Total length of ACK slot, ACK delimiter and end of frame, bits."""
+"""Total length of the ACK slot, ACK delimiter and end of frame, bits."""
 
 _STUFF_AFTER: Final = 5
 _FIXED_STUFF_SPACING: Final = 5
@@ -29,13 +29,13 @@ _CRC_21: Final = 0x102899
 
 @dataclass(frozen=True, slots=True)
 class WireFrame:
-    """Bit sequence of an acknowledged frame, with stuff bits. Dominant bits are 0."""
+    """Bit sequence of an acknowledged frame, including stuff bits. Dominant bits are 0."""
 
     bits: tuple[int, ...]
     """Bits from the start of frame to the last bit of the end of frame."""
     stuffed_end: int
-    """Number of bits subject to the stuff rule, including stuff bits: up to the end of the CRC sequence, or
-    of the data in CAN FD."""
+    """Number of bits subject to the stuff rule, including stuff bits. These bits end with the CRC sequence,
+    or with the data in CAN FD."""
     plain: int
     """Number of bits subject to the stuff rule, excluding stuff bits."""
     fixed_stuff: tuple[int, ...]
@@ -60,8 +60,8 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
     """Build the bit sequence of a frame.
 
     Args:
-        frame: frame to send.
-        esi: whether the error state indicator of a CAN FD frame is recessive.
+        frame: Frame to send.
+        esi: Whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
         Bit sequence with a dominant ACK slot.
@@ -76,7 +76,7 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
         return WireFrame((*stuffed, *tail), n, n - len(places), (), n, range(0))
 
     stuffed, places = _stuffed((*head, *payload))
-    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit takes its place
+    if places[-1:] == [len(stuffed) - 1]:  # replaced by the first fixed stuff bit
         del stuffed[-1], places[-1]
     count = len(places) % 8
     gray = count ^ count >> 1
@@ -99,7 +99,7 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
 
 
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
-    """Return the number of bits of an error flag after which a receiver detects an error.
+    """Return the number of error flag bits after which a receiver detects an error.
 
     The flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or the form
     of the delimiters and the end of frame. If it violates none of these rules, it corrupts the CRC, and a
@@ -107,14 +107,14 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
     it sees.
 
     Args:
-        wire: bit sequence of the frame.
-        position: position of the bit in which another station detects the error.
-        seen: value that the receiver sees at ``position``.
+        wire: Bit sequence of the frame.
+        position: Position of the bit in which another station detects the error.
+        seen: Value that the receiver sees at ``position``.
         flag: 0 for an active error flag, 1 for a passive error flag.
 
     Returns:
-        0 to 6 bits of an active error flag, or 0 to 7 bits of a passive one. 0 means that the bit at
-        ``position`` is itself an error to the receiver.
+        0 to 6 bits of an active error flag, or 0 to 7 bits of a passive error flag. 0 means that the receiver
+        already detects an error in the bit at ``position``.
     """
     stream = (*wire.bits[:position], seen, *(flag,) * _MAX_LAG)
     last = run = plain = 0
@@ -171,7 +171,7 @@ def _head(frame: CanFrame, esi: bool) -> Iterator[int]:
 
 
 def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return a bit sequence with stuff bits inserted, and the positions of the stuff bits."""
+    """Insert stuff bits into a bit sequence; return the result and the positions of the stuff bits."""
     out: list[int] = []
     places: list[int] = []
     run = 0
@@ -186,7 +186,7 @@ def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def _with_stuff_bits(place: int, stuff_places: Sequence[int]) -> int:
-    """Convert a position in the unstuffed frame to the position in the stuffed frame."""
+    """Convert a bit position in the unstuffed frame to the position of the same bit in the stuffed frame."""
     for stuff in stuff_places:
         if stuff > place:
             break

@@ -13,7 +13,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Maximum deviation of a quaternion's length from 1; accounts for rounded input."""
+"""Maximum deviation of a quaternion's length from 1, which allows rounded input."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +46,8 @@ class Pose:
 
         Args:
             position_m: Origin of the frame in the parent frame, metres.
-            rpy_rad: Rotations about the fixed axes x (roll), y (pitch) and z (yaw) of the parent frame, in
-                this order, radians.
+            rpy_rad: Rotations in radians about the fixed axes x (roll), y (pitch) and z (yaw) of the parent
+                frame, applied in that order.
         """
         (sr, sp, sy), (cr, cp, cy) = (
             tuple(function(angle / 2) for angle in rpy_rad) for function in (math.sin, math.cos)
@@ -107,7 +107,7 @@ class Pose:
         return Pose((x_m, y_m, z_m), back.quaternion_xyzw)
 
     def _unit(self) -> tuple[float, float, float, float]:
-        """Return the quaternion scaled to unit length; otherwise rounding errors would accumulate."""
+        """Return the quaternion scaled to unit length, so that rounding errors do not accumulate."""
         length = math.hypot(*self.quaternion_xyzw)
         x, y, z, w = self.quaternion_xyzw
         return x / length, y / length, z / length, w / length

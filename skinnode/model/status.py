@@ -26,7 +26,7 @@ class Status(enum.IntEnum):
     INVALID_START = 7
     """F or its Jacobian is not finite at the starting point, which `solve_system` returns unchanged."""
     INCONSISTENT = 8
-    """No deformation explains the resistances: χ² is far too large for noise."""
+    """No deformation explains the resistances: χ² is far larger than noise can explain."""
 
 
 _BY_NUMBER = tuple(Status)

@@ -29,7 +29,7 @@ class FaultBook:
 
     Args:
         live: Whether the source is a running hand, whose patches must be operational soon after the start. A
-            recording may begin before its patches are started, so they are checked only at the end.
+            recording can begin before its patches are started, so they are checked only at the end.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -49,7 +49,8 @@ class FaultBook:
         Args:
             view: Current view of the hand.
             real_ns: Monotonic time of the monitor, ns.
-            ending: Whether the session is ending; a patch that has never been operational is then a fault.
+            ending: Whether the session is ending; a patch that has never been operational then counts as a
+                fault.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
@@ -73,7 +74,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return pairs (key, text) for wire faults, a duplicate node-ID and the last EMCY of a patch."""
+    """Return (key, text) pairs for wire faults, a duplicate node-ID and the last EMCY of a patch."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -96,7 +97,7 @@ def watch(
         faults: Faults of the session, updated at each check.
 
     Raises:
-        SkinError: The source failed.
+        SkinError: If the source has failed.
     """
     begun_s = due_s = time.monotonic()
     due_s += LINE_S

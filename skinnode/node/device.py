@@ -3,8 +3,8 @@
 The device has no thread and reads no clock, so its behaviour is deterministic. The caller passes received
 frames and their arrival times to :meth:`CanopenDevice.on_frame`, and calls :meth:`CanopenDevice.on_timer` at
 the time given by :meth:`CanopenDevice.next_deadline_ns`. On a bus, :class:`~skinnode.node.runner.NodeRunner`
-is the caller. The device handles every frame without an exception. Exceptions from the application and from
-``send`` propagate to the caller.
+is the caller. The device handles every frame without raising an exception. Exceptions from the application
+and from ``send`` propagate to the caller.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ Handler = Callable[[bytes, int], None]
 
 
 class CanopenDevice:
-    """CANopen device. It is silent until :meth:`power_on`.
+    """CANopen device. It is silent until :meth:`power_on` is called.
 
     Args:
         node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
             memory takes precedence.
-        objects: declarations of the node's object dictionary.
+        objects: declarations of the objects in the node's object dictionary.
         application: function that creates the application, given the device's services.
         send: function that sends a frame, given its COB-ID and payload.
         serial: serial number (0x1018:4), u32.
         memory: non-volatile memory of the device, or None.
-        kind: identifier of the sizes and layout of the patch. Memory content that was saved with another
-            identifier is not used.
+        kind: identifier of the patch's sizes and layout. Memory contents saved with another identifier are
+            not used.
         set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:
@@ -157,7 +157,7 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change in the CAN controller's state.
 
-        At bus-off, the error behaviour (0x1029) takes effect immediately. The emergency message follows when
+        At bus-off, the error behaviour (0x1029) takes effect immediately. The emergency message follows once
         the bus has recovered.
 
         Args:
@@ -202,7 +202,7 @@ class CanopenDevice:
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Perform all actions that are due at ``t_ns``. Before the next deadline, this has no effect.
+        """Perform all actions that are due at ``t_ns``. Calls before the next deadline have no effect.
 
         Args:
             t_ns: current time, ns.
@@ -243,7 +243,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Reset the objects and services, and boot unless the node has no node-ID."""
+        """Reset the objects and services, and boot if the node has a node-ID."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -308,7 +308,7 @@ class CanopenDevice:
             self._synchronise(data, t_ns)
 
     def _synchronise(self, sync: bytes, t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL: apply RPDOs, then call the application, then send TPDOs."""
+        """Handle a SYNC received in OPERATIONAL: apply RPDOs, call the application, then send TPDOs."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
@@ -363,7 +363,7 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Rebuild the table of handlers for all received COB-IDs except those of RPDOs."""
+        """Rebuild the table of handlers for all received COB-IDs except the RPDO COB-IDs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time

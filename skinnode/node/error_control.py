@@ -23,8 +23,8 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. The other
-node may lose a heartbeat without ending the conflict."""
+"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. A lost
+heartbeat of the other node does not end the conflict."""
 _RIVAL_NS: Final = 750_000_000
 """Duration of silence (ns) after which a node-ID conflict is considered resolved if this node sends no
 heartbeats. It equals three default heartbeat periods.
@@ -36,7 +36,7 @@ class ErrorControl:
 
     Args:
         services: resources that all services of the node share.
-        listen: callback for a change of :meth:`handlers`.
+        listen: callback for a change in the result of :meth:`handlers`.
         failed: callback for a heartbeat event or life guarding event, given its time in ns.
     """
 
@@ -84,7 +84,7 @@ class ErrorControl:
         return handlers
 
     def reset(self, node_id: int) -> None:
-        """Reset all error control services, and forget all received heartbeats and guarding requests.
+        """Reset all error control services and forget all received heartbeats and guarding requests.
 
         Args:
             node_id: node-ID of this node.

@@ -15,12 +15,12 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pacing import NO_DEADLINE_NS
 
 _BOOTED: Final = 1
-"""Second manufacturer-specific byte of the emergency message if a monitored node has restarted; 0 if its
-heartbeat is overdue."""
+"""Second manufacturer-specific byte of the emergency message for a monitored node that has restarted; 0 means
+that its heartbeat is overdue."""
 
 
 class HeartbeatProducer:
-    """Schedule of a node's heartbeats. A delay of a whole period or more shifts the schedule."""
+    """Schedule of a node's heartbeats. A delay of one period or more shifts the schedule."""
 
     def __init__(self) -> None:
         self.period_ns = 0
@@ -88,12 +88,12 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Apply 0x1016 after a reset, and forget all received heartbeats."""
+        """Apply 0x1016 after a reset and forget all received heartbeats."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Apply a write to 0x1016. Monitoring by a changed entry starts at the next heartbeat."""
+        """Apply a write to 0x1016. For a changed entry, monitoring starts at the next heartbeat."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -128,7 +128,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report the monitored nodes whose heartbeat has become overdue."""
+        """Report the monitored nodes whose heartbeats have become overdue."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():

@@ -1,6 +1,6 @@
 """LSS slave (CiA 305 v3.0), through which a master finds nodes and sets their node-IDs and bit rates.
 
-The slave turns requests into responses, and accesses neither a bus nor a clock. It handles requests in every
+The slave turns requests into responses and accesses neither a bus nor a clock. It handles requests in every
 NMT state. A node without a node-ID handles no other requests.
 """
 
@@ -110,13 +110,13 @@ class LssSlave:
         self._scan_part = 0
 
     def on_request(self, data: bytes) -> bytes | None:
-        """Handle a request of the LSS master.
+        """Handle a request from the LSS master.
 
         CiA 305 requires a slave to ignore frames that are not 8 bytes long, unknown commands, and requests
         that are not allowed in its current state, which may be intended for other slaves.
 
         After *activate bit timing*, the node is silent for twice the delay in the request. It changes its bit
-        rate halfway. In the second half, the other nodes have time to change their bit rates.
+        rate halfway. The second half gives the other nodes time to change their bit rates.
 
         Args:
             data: payload of the frame.
@@ -155,7 +155,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Return whether the LSS address matches this request and the preceding ones of its sequence."""
+        """Return whether the LSS address matches this request and the preceding requests in its sequence."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -175,7 +175,7 @@ class LssSlave:
             if (self._address[part] ^ value) >> bit:
                 return None
             self._scan_part = next_part
-            # The whole address matches: the master has found this slave.
+            # The entire address matches: the master has found this slave.
             if bit == 0 and next_part < part:
                 self._enter(LssState.CONFIGURATION)
         return _frame(LssCommand.IDENTIFIED)
@@ -218,7 +218,7 @@ class LssSlave:
 
 
 class BitRateChange:
-    """Bit rate change after *activate bit timing*, with a delay before and after the change.
+    """Performs the bit rate change for *activate bit timing*, with a delay before and after the change.
 
     Args:
         set_bit_rate: function that changes the bit rate (bit/s), or None if it cannot be changed.
@@ -256,7 +256,7 @@ class BitRateChange:
         return self.deadline_ns != NO_DEADLINE_NS
 
     def cancel(self) -> None:
-        """Cancel the bit rate change when the node is switched off."""
+        """Cancel the bit rate change because the node is being switched off."""
         self.deadline_ns = NO_DEADLINE_NS
 
 

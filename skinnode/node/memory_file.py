@@ -21,7 +21,7 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum accepted size of a memory file, bytes; over ten times the size of the largest valid file."""
+"""Maximum accepted size of a memory file in bytes; more than ten times the size of the largest valid file."""
 
 
 class FileMemory:
@@ -32,11 +32,11 @@ class FileMemory:
     separate file in the same folder, which the kernel releases even if the process is killed.
 
     **Saving** writes a temporary file, flushes it to the disk and renames it to the memory file. If the power
-    fails or the process is killed, the memory file has either its old or its new content. Saving takes a few
+    fails or the process is killed, the memory file has either its old or its new contents. Saving takes a few
     milliseconds, during which all nodes on the same thread are blocked.
 
     Only the owner can read the file (mode 0600). A symbolic link is rejected. A file that is damaged or
-    belongs to another patch is not overwritten, but renamed: ``.unused-`` and a digest of its content are
+    belongs to another patch is not overwritten but renamed: ``.unused-`` and a digest of its contents are
     appended to its name.
 
     Args:
@@ -74,10 +74,10 @@ class FileMemory:
         self.close()
 
     def load(self) -> Kept | None:
-        """Return the content, or None if the file does not exist.
+        """Return the contents, or None if the file does not exist.
 
         Raises:
-            MemoryFault: if the file cannot be read, or its content is not usable.
+            MemoryFault: if the file cannot be read, or its contents are not usable.
         """
         try:
             return unpack(self._read())
@@ -89,14 +89,14 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content, and return once the new content is on the disk.
+        """Replace the contents, and return once the new contents are on disk.
 
         Args:
             kept: new content.
 
         Raises:
             FileInUse: if this process or another process has locked the file.
-            OSError: if the file cannot be written. It keeps its old content.
+            OSError: if the file cannot be written. The file keeps its old contents.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -109,7 +109,7 @@ class FileMemory:
         flush_folder(self.path.parent)
 
     def _read(self) -> bytes:
-        # O_NONBLOCK: opening a named pipe would block otherwise.
+        # O_NONBLOCK: otherwise, opening a named pipe would block.
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             descriptor = os.open(self.path, flags)
@@ -137,7 +137,7 @@ class FileMemory:
 
 
 def pack(kept: Kept) -> bytes:
-    """Return the bytes of a memory file with the given content."""
+    """Return the bytes of a memory file with the given contents."""
     content = {
         "patch": kept.patch,
         "node_id": kept.node_id,
@@ -151,7 +151,7 @@ def pack(kept: Kept) -> bytes:
 
 
 def unpack(data: bytes) -> Kept:
-    """Return the content of a memory file.
+    """Return the contents of a memory file.
 
     Args:
         data: bytes of the file.

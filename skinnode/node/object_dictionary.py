@@ -21,12 +21,12 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Maximum length of a value with a variable-length data type, bytes."""
+"""Maximum length in bytes of a value with a variable-length data type."""
 
 Reader = Callable[[int], bytes]
-"""Callback that returns the bytes of a sub-index, or raises Refused."""
+"""Callback that returns the bytes of a sub-index or raises Refused."""
 Guard = Callable[[int, int], None]
-"""Callback that checks a new value, and raises Refused to reject it. Its arguments are the sub-index and the
+"""Callback that checks a new value and raises Refused to reject it. Its arguments are the sub-index and the
 value as an unsigned integer; a REAL32 is passed as its bit pattern."""
 Watcher = Callable[[int], None]
 """Callback for a write by a client. Its argument is the sub-index."""
@@ -37,7 +37,7 @@ DomainWriter = Callable[[bytes], None]
 
 
 class Lengths(NamedTuple):
-    """Range of lengths that a client may write to an object."""
+    """Permitted lengths of the values that a client writes to an object."""
 
     least: int
     """Minimum length, bytes."""
@@ -55,7 +55,7 @@ class Lengths(NamedTuple):
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check the length of a value of which more may follow.
+        """Check the length received so far of a value that may be incomplete.
 
         Raises:
             Refused: if the length exceeds the maximum.
@@ -72,7 +72,7 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
         value: value; bytes are returned unchanged.
 
     Raises:
-        OverflowError: if the value does not fit into the integer type.
+        OverflowError: if the value does not fit in the integer type.
         struct.error: if the value is not a number but the data type is REAL32.
     """
     if isinstance(value, bytes):
@@ -137,7 +137,7 @@ class ObjectStore:
         self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
-        """Register ``guard`` to check each value that a client writes to ``index``, before it is stored."""
+        """Register ``guard`` to check each value that a client writes to ``index`` before it is stored."""
         self._guards[index] = guard
 
     def watch(self, index: int, watcher: Watcher) -> None:
@@ -145,7 +145,7 @@ class ObjectStore:
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Register ``watcher`` to be called when a client has changed an object that is not computed."""
+        """Register ``watcher`` to be called after a client changes an object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
@@ -164,7 +164,7 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the range of lengths that a client may write to an object.
+        """Return the permitted lengths of the values that a client writes to an object.
 
         Raises:
             Refused: if the object does not exist or is read-only.
@@ -191,7 +191,7 @@ class ObjectStore:
         """Write an object for a client: check and store the value, then call the watcher.
 
         Raises:
-            Refused: if the object cannot be written or does not accept the value.
+            Refused: if the object cannot be written or rejects the value.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
@@ -222,7 +222,7 @@ class ObjectStore:
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the stored bytes of an object, even if reads return a computed value."""
+        """Return the stored bytes of an object, even if reading it returns a computed value."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:

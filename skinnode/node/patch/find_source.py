@@ -41,7 +41,7 @@ def load(reference: str, option: str) -> Any:
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """Create the source of a patch, and read it once to detect faults before the node starts.
+    """Create the source of a patch and read it once to detect faults before the node starts.
 
     Args:
         name: entry point or ``MODULE:NAME`` of a class or function that takes the layout and returns a

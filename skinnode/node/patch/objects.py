@@ -63,8 +63,8 @@ def bind_baseline(
     Args:
         store: object dictionary.
         acquisition: contains the baseline.
-        changed: callback for a write of the R0 of one crossing.
-        replaced: callback for a write of the whole baseline.
+        changed: callback for a write to the R0 of one crossing.
+        replaced: callback for a write to the whole baseline.
     """
     profile = acquisition.profile
     for row in range(profile.rows):
@@ -84,7 +84,7 @@ def bind_baseline(
 
 
 def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
-    """Return the slice of each sub-index within the concatenated bytes of a record.
+    """Return each sub-index's slice of the concatenated bytes of a record.
 
     Args:
         store: object dictionary.
@@ -120,7 +120,7 @@ def _bind_baseline_row(
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
-    """Return the bit mask of 32 wires at a sub-index: open wires if odd, shorted wires if even."""
+    """Return a sub-index's bit mask of 32 wires: open wires if it is odd, shorted wires if even."""
     first = (subindex - 1) // 2 * 32
     bits = masks[(subindex - 1) % 2][first : first + 32]
     return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")

@@ -1,4 +1,4 @@
-"""CANopen node of a patch: the device of :mod:`skinnode.node.device` with the application of a patch."""
+"""CANopen node of a patch: a :mod:`skinnode.node.device` that runs the patch application."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):
-    """CANopen node of one patch. It is silent until :meth:`power_on`.
+    """CANopen node of one patch. It is silent until :meth:`power_on` is called.
 
     Args:
         node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
@@ -39,7 +39,7 @@ class PatchNode(CanopenDevice):
 
     Raises:
         ValueError: if an argument is out of range.
-        ConfigError: if the layout does not fit the wire format.
+        ConfigError: if the wire format cannot represent the layout.
     """
 
     def __init__(  # noqa: PLR0913 - public keywords, one for each part that a board brings

@@ -12,17 +12,17 @@ from skinnode.model.layout import Float, require_array
 class ResistanceSource(Protocol):
     """Source of the resistances between the upper and the lower wires of a patch.
 
-    A source may also have an integer attribute ``conversions``: the number of times that the converter has
-    measured all crossings. The node reads it after :meth:`read`, and states in the summary whether it has
-    changed. The host can then detect a stopped converter immediately. If the attribute is missing or None,
-    the host must rely on the codes to detect a stopped converter.
+    A source can also have an integer attribute ``conversions``: the number of times that the converter has
+    measured all crossings. The node reads it after calling :meth:`read` and states in the summary whether it
+    has changed. The host can then detect a stopped converter immediately. If the attribute is missing or
+    None, the host must rely on the codes to detect a stopped converter.
 
-    The converter itself must count the conversions, not :meth:`read`, and it must measure all crossings at
-    least once per scan. Otherwise, the source must not have this attribute.
+    The conversions must be counted by the converter itself, not by :meth:`read`, and the converter must
+    measure all crossings at least once per scan. Otherwise, the source must not have this attribute.
     """
 
     def read(self, t_ns: int) -> Float:
-        """Return (U, K) resistances, ohm; infinite for an open crossing, 0 for a shorted crossing.
+        """Return (U, K) resistances in ohms; infinite for an open crossing, 0 for a shorted crossing.
 
         The node copies the array. If this method raises an exception, the node reports a source failure and
         tries again at the next scan.
@@ -74,10 +74,10 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
         t_ns: current time, ns.
 
     Returns:
-        Copy of the (U, K) resistances, ohm, as float64.
+        Copy of the resistances in ohms, (U, K) float64.
 
     Raises:
-        SourceFailed: if the source raises an exception, or does not return an array of numbers with the
+        SourceFailed: if the source raises an exception or does not return an array of numbers with the
             required shape. The message is a single line.
     """
     try:

@@ -1,4 +1,4 @@
-"""Detection of open and shorted wires from the codes of a scan, reported with EMCY 0x5000."""
+"""Detects open and shorted wires from the codes of a scan and reports them with EMCY 0x5000."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ class WireFaults:
 
 @functools.cache
 def _no_faults(shape: tuple[int, int]) -> WireFaults:
-    """Return the value for a patch with (U, K) wires and no wire faults. Its arrays are read-only."""
+    """Return the value for a patch that has U upper and K lower wires and no wire faults. Its arrays are
+    read-only."""
     upper, lower = (np.zeros(wires, dtype=np.bool_) for wires in shape)
     for mask in (upper, lower):
         mask.flags.writeable = False
@@ -62,7 +63,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
         codes: (U, K) codes.
         scale: mapping of R/R0 to codes.
     """
-    if codes.max() < scale.short:  # as in nearly every scan
+    if codes.max() < scale.short:  # the usual case
         return _no_faults((codes.shape[0], codes.shape[1]))
     is_open, is_short = codes == scale.open, codes == scale.short
     return WireFaults(is_open.all(axis=1), is_short.all(axis=1), is_open.all(axis=0), is_short.all(axis=0))
@@ -87,8 +88,8 @@ class WireFaultReporter:
     def report(self, faults: WireFaults, t_ns: int) -> None:
         """Report new wire faults, or the end of all wire faults.
 
-        Faults that begin in the same scan, as when a connector is unplugged, are reported in one message. It
-        contains the type and wire number of the first new fault, and the number of faulty wires.
+        Faults that begin in the same scan, such as when a connector is unplugged, are reported in one
+        message. It contains the type and wire number of the first new fault, and the number of faulty wires.
 
         Args:
             faults: current wire faults.

@@ -71,8 +71,7 @@ class Source(Protocol):
         """Return the events that have occurred since the last call."""
 
     def fields(self, capacity: int) -> Subscription:
-        """Subscribe to the fields of all patches; a full queue (``capacity`` fields) drops the oldest
-        field."""
+        """Subscribe to the fields of all patches; the queue keeps the newest ``capacity`` fields."""
 
     def now_ns(self) -> int:
         """Return the current time in ns on the monotonic clock used in snapshots."""

@@ -33,8 +33,7 @@ class Application(Protocol):
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL. ``turns`` contains the numbers of the synchronous TPDOs that are
-        due."""
+        """Handle a SYNC in OPERATIONAL. ``turns`` contains the numbers of the due synchronous TPDOs."""
         ...
 
     def on_timer(self, t_ns: int) -> None:

@@ -174,8 +174,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return a sub-index of the error history: the number of entries (0) or an entry (1 is the
-        newest)."""
+        """Return a sub-index of the error history: the number of entries (0) or an entry (1 = newest)."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):

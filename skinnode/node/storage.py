@@ -1,6 +1,6 @@
 """Storage of the parameters, the baseline and the LSS configuration of a node.
 
-This module implements the objects 0x1010 (store parameters), 0x1011 (restore default parameters) and 0x1020
+This module implements objects 0x1010 (store parameters), 0x1011 (restore default parameters) and 0x1020
 (verify configuration) of CiA 301 v4.2. A *parameter* is an object that a client can write and read back.
 Commands and computed objects are not parameters.
 """
@@ -26,7 +26,7 @@ APPLICATION: Final = 0x2000, 0x9FFF
 EVERYTHING: Final = 0x1000, 0x9FFF
 """First and last index of all parameters."""
 _ALL, _COMMUNICATION_ONLY, _APPLICATION_ONLY = 1, 2, 3
-"""Sub-indices of 0x1010 and 0x1011, which select all, communication or application parameters."""
+"""Sub-indices of 0x1010 and 0x1011 that select all, communication or application parameters."""
 
 _CAN_ID_MASK: Final = 0x7FF
 
@@ -36,7 +36,7 @@ Rows = tuple[tuple[float, ...], ...]
 class Storage:
     """Saves and restores the non-volatile values of a node.
 
-    If this fails, the node sends EMCY 0x6300, whose first manufacturer-specific byte is a
+    If saving or restoring fails, the node sends EMCY 0x6300, whose first manufacturer-specific byte is a
     :class:`~skinnode.node.memory.Fault`.
 
     Args:
@@ -55,7 +55,7 @@ class Storage:
         self.problem = ""
         """One-line description of the latest memory problem; empty if there has been none."""
         self.baseline_ohm: Callable[[], Rows] = tuple
-        """Function that returns the baseline R0, ohm. Set by the application."""
+        """Function that returns the baseline R0 in ohms. Set by the application."""
         # 1 means that the node saves or restores parameters on command.
         able = int(memory is not None).to_bytes(4, "little")
         for index, signature, command in (
@@ -88,7 +88,7 @@ class Storage:
         if kept is not None and kept.patch != patch:
             self.note(
                 Fault.FOREIGN,
-                why=f"the content belongs to the patch {kept.patch!r}, but this patch is {patch!r}",
+                why=f"the contents belong to the patch {kept.patch!r}, but this patch is {patch!r}",
             )
         elif kept is not None:
             self._kept = kept
@@ -141,7 +141,7 @@ class Storage:
             self._clear_verification()  # this is not the configuration that was verified
 
     def keep_baseline(self) -> None:
-        """Save the baseline, if the node has a memory."""
+        """Save the baseline if the node has a memory."""
         if self._memory is None:
             return
         try:
@@ -168,7 +168,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """End the given faults, and report their end."""
+        """End the given faults and report their end."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -183,8 +183,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # With this command, the user accepts the current parameters, so faults of the memory's content
-            # end. Saving the baseline automatically does not end them.
+            # With this command, the user accepts the current parameters, so any faults in the memory's
+            # contents end. Saving the baseline automatically does not end them.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -197,7 +197,8 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # 0x1020 identifies a whole configuration, so it is saved only together with one.
+        # 0x1020 identifies a complete configuration, so it is saved only together with a complete
+        # configuration.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 

@@ -13,7 +13,7 @@ class Timers:
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
-        self._heap: list[tuple[int, int]] = []  # may contain entries of timers that were changed or cancelled
+        self._heap: list[tuple[int, int]] = []  # may contain entries for changed or cancelled timers
 
     @property
     def deadline_ns(self) -> int:

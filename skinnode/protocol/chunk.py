@@ -24,7 +24,7 @@ class Chunk(NamedTuple):
     """Contents of a chunk, as sent on a classic CAN bus."""
 
     chunk: int
-    """Chunk index. The first code of the chunk is code ``chunk · codes_per_chunk`` of the scan."""
+    """Chunk index. The chunk begins with code ``chunk · codes_per_chunk`` of the scan."""
     scan: int
     """Scan counter, u8."""
     codes: tuple[int, ...]
@@ -40,7 +40,7 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
         bits: width of a code, 16 or 24.
 
     Raises:
-        ValueError: if a value does not fit into its field, or if there are too many codes.
+        ValueError: if a value does not fit in its field or there are too many codes.
     """
     width = bits // 8
     if not (0 <= chunk <= 255 and 0 <= scan <= 255):
@@ -83,7 +83,7 @@ def pack_scan(
         only: chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
 
     Raises:
-        ValueError: if the shape is wrong, or if a code to pack has more bits than ``profile`` allows.
+        ValueError: if the shape is wrong or a code to pack has more bits than ``profile`` allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
@@ -111,7 +111,7 @@ def pack_scan(
 
 @functools.cache
 def _empty_chunks(profile: PatchProfile) -> NDArray[np.uint8]:
-    """Return (chunks, bytes) payloads whose scan counter and codes are still zero."""
+    """Return (chunks, bytes) payloads in which the scan counter and the codes are still zero."""
     n = profile.n_chunks
     chunks = np.zeros((n, profile.chunk_bytes), dtype=np.uint8)
     if profile.bus == "classic":
@@ -171,7 +171,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return, for each of the (U, K) codes, the number of its chunk, counted from 0 in sending order."""
+    """Return the (U, K) chunk numbers of the codes, counted from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -181,7 +181,7 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 
 
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
-    """Return a function that reads the number of a chunk (:func:`chunk_of_code`) from its payload.
+    """Return a function that reads a chunk's number (:func:`chunk_of_code`) from its payload.
 
     The function returns ``n_chunks`` or more if the patch has no such chunk. The length of the payload must
     already have been checked.

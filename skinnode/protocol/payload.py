@@ -8,7 +8,7 @@ from skinnode.errors import CodecError
 from skinnode.text.words import counted
 
 PDO_BYTES: Final = 8
-"""Length of a summary, and of a chunk on classic CAN, bytes."""
+"""Length in bytes of a summary and of a chunk on classic CAN."""
 
 
 def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:

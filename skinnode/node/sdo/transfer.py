@@ -26,7 +26,7 @@ class Channel:
     send: Callable[[bytes], None]
     """Function that sends a response of eight bytes."""
     timeout_ns: int
-    """Maximum time (ns) to wait for the next request of a client."""
+    """Maximum time (ns) to wait for a client's next request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Target:
 
 
 class Transfer(ABC):
-    """Transfer that takes several requests. Its methods raise Refused to abort it.
+    """Transfer that requires several requests. Its methods raise Refused to abort it.
 
     Args:
         channel: SDO server channel.
@@ -64,7 +64,7 @@ class Transfer(ABC):
         """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
 
     def on_timer(self, t_ns: int) -> None:
-        """Abort the transfer, because it has timed out. Overridden if the transfer has other timer events.
+        """Abort the transfer because it has timed out. Overridden if the transfer has other timer events.
 
         Raises:
             Refused: always.
@@ -81,10 +81,10 @@ class Incoming:
     Args:
         store: object dictionary.
         target: object to read or write.
-        announced: size announced by the client, bytes, or None.
+        announced: size in bytes announced by the client, or None.
 
     Raises:
-        Refused: if the object is not writable, or does not accept the announced size.
+        Refused: if the object is not writable or rejects the announced size.
     """
 
     def __init__(self, store: ObjectStore, target: Target, announced: int | None) -> None:
@@ -111,7 +111,7 @@ class Incoming:
         """Write the complete value to the object.
 
         Raises:
-            Refused: if the value is too short, or the object does not accept it.
+            Refused: if the value is too short or the object rejects it.
         """
         if self._announced is not None and len(self.data) < self._announced:
             raise Refused(AbortCode.TOO_SHORT)

@@ -24,7 +24,7 @@ class Scan:
     scan: int
     """Scan counter without wrap-around. It starts at the first counter received and increases."""
     complete: bool
-    """Whether the codes are known to match what the node packed: all chunks arrived or are known to be
+    """Whether the codes are known to match those that the node packed: all chunks arrived or are known to be
     unchanged, and, in a checked stream, the check passed."""
     chunks_expected: int
     """Number of chunks sent, according to the summary; the number of chunks in a full scan if the summary was

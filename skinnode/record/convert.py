@@ -1,6 +1,6 @@
-"""Converts recordings between file formats, and computes field tables from recordings.
+"""Converts recordings between file formats and computes field tables from recordings.
 
-The file suffixes determine the formats. A conversion between two files with frames copies every frame and the
+The file suffixes determine the formats. A conversion between two frame files copies every frame and the
 journal, so a replay of the result computes the same fields. An MCAP target also receives the fields, contacts
 and poses, which a replay computes. A field table contains the results of a replay and the resistances.
 """
@@ -50,7 +50,7 @@ class Conversion:
     faults: tuple[str, ...]
     """Messages about missing or unreadable parts of the source."""
     notes: tuple[str, ...]
-    """Messages about assumptions, and about data that the target cannot contain."""
+    """Messages about assumptions and about data that the target cannot contain."""
 
 
 class FieldTable(Protocol):
@@ -101,7 +101,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
         raise ConfigError("source", str(source), _ending_in(TARGETS))
     allowed = TABLES if source.suffix in TABLES else TARGETS
     if target.suffix not in allowed:
-        why = "; a table of fields contains no frames" if source.suffix in TABLES else ""
+        why = "; a field table contains no frames" if source.suffix in TABLES else ""
         raise ConfigError("target", str(target), _ending_in(allowed) + why)
     if source.suffix in TABLES and hand is not None:
         raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
@@ -117,7 +117,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
 
 
 def _share_journal(source: Path, target: Path) -> bool:
-    """Return whether both files are logs with the same name in the same folder and so share a journal."""
+    """Return whether both files are logs with the same name and folder, and therefore share a journal."""
     both_logs = {source.suffix, target.suffix} <= set(WRITABLE)
     return both_logs and journal_of(source) == journal_of(target)
 
@@ -144,7 +144,7 @@ def _tabulate(recording: OpenRecording, target: Path) -> Conversion:
     kept: deque[ResistanceFrame] = deque()
     run = Replay(recording, solver=lambda facts, hand, now: KeepingSolver(facts, hand, now, kept))
     fields = _write_table(target, recording.lines[0] if recording.lines else "", _rows(run, kept))
-    lost = "frames, journal, health and events; a recording cannot be made from it again"
+    lost = "frames, journal, health and events; it cannot be converted back to a recording"
     if target.suffix == NPZ:
         lost = f"contacts, faults, {lost}"
     return Conversion(0, fields, tuple(run.flaws), (*run.notes, f"{target.name} cannot contain {lost}"))
@@ -251,7 +251,7 @@ class CopiedFrames:
 
 
 def _losses(recording: OpenRecording, target: Path, tee: CopiedFrames) -> list[str]:
-    """Describe, in at most one line, the data that the target cannot contain."""
+    """Return at most one line that describes the data that the target cannot contain."""
     lost = []
     from_mcap = recording.frames.path.suffix == MCAP
     if from_mcap and target.suffix != MCAP:

@@ -200,7 +200,7 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(recorded: Path,
         (
             tmp_path / "x.npz",
             "y.mcap",
-            "allowed: a file ending in .parquet or .npz; a table of fields contains",
+            "allowed: a file ending in .parquet or .npz; a field table contains",
         ),
         (recorded, "y.txt", "allowed: a file ending in .log, .blf, .asc, .mcap, .parquet or .npz"),
         (recorded, "x.npz", "allowed: a new file; this one exists and is not overwritten"),

@@ -25,7 +25,7 @@ and increases R above R0."""
 DEFAULT_THRESHOLD_CODES: Final = 2
 """Default for the largest code change, in codes, that is not sent in send mode 1."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Default interval, in scans, between full scans in send mode 1 (changed chunks only). At a scan period of 80
+"""Default interval, in scans, between full scans in send mode 1 (changed chunks only). With a period of 80
 ms, a lost chunk is sent again within 0.8 s. The full scans add one tenth of the traffic of send mode 0."""
 
 

@@ -49,17 +49,17 @@ class CanopenDevice:
     Args:
         node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
             memory takes precedence.
-        objects: declarations of the objects in the node's object dictionary.
-        application: function that creates the application, given the device's services.
-        send: function that sends a frame, given its COB-ID and payload.
-        serial: serial number (0x1018:4), u32.
-        memory: non-volatile memory of the device, or None.
-        kind: identifier of the patch's sizes and layout. Memory contents saved with another identifier are
+        objects: Declarations of the objects in the node's object dictionary.
+        application: Function that creates the application, given the device's services.
+        send: Function that sends a frame, given its COB-ID and payload.
+        serial: Serial number (0x1018:4), u32.
+        memory: Non-volatile memory of the device, or None.
+        kind: Identifier of the patch's sizes and layout. Memory contents saved with another identifier are
             not used.
-        set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
+        set_bit_rate: Function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: If an argument is out of range.
     """
 
     def __init__(  # noqa: PLR0913 - the keywords of the public PatchNode, passed on
@@ -113,7 +113,7 @@ class CanopenDevice:
         """Start the application and boot. A device without a node-ID first waits until LSS assigns one.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         self._now_ns = t_ns
         self._storage.load()
@@ -134,10 +134,10 @@ class CanopenDevice:
         """Handle a frame with an 11-bit identifier.
 
         Args:
-            can_id: identifier of the frame.
-            data: payload of the frame; ignored for a remote frame.
-            t_ns: arrival time, ns.
-            remote: whether the frame is a remote frame.
+            can_id: Identifier of the frame.
+            data: Payload of the frame; ignored for a remote frame.
+            t_ns: Arrival time, ns.
+            remote: Whether the frame is a remote frame.
         """
         if self._bit_rate_change.silent(t_ns):
             return
@@ -161,8 +161,8 @@ class CanopenDevice:
         the bus has recovered.
 
         Args:
-            state: new state of the CAN controller.
-            t_ns: current time, ns.
+            state: New state of the CAN controller.
+            t_ns: Current time, ns.
         """
         was, self._bus_state = self._bus_state, state
         if self.nmt_state is NmtState.INITIALISING or state is was:
@@ -205,7 +205,7 @@ class CanopenDevice:
         """Perform all actions that are due at ``t_ns``. Calls before the next deadline have no effect.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:
             return

@@ -26,8 +26,8 @@ class EmcyProducer:
     """EMCY producer of a node, which reports the beginning and the end of each error.
 
     Args:
-        store: object dictionary.
-        send: function that sends a frame, given its COB-ID and payload.
+        store: Object dictionary.
+        send: Function that sends a frame, given its COB-ID and payload.
     """
 
     def __init__(self, store: ObjectStore, send: Callable[[int, bytes], None]) -> None:
@@ -57,9 +57,9 @@ class EmcyProducer:
         """Report an error, immediately followed by its end.
 
         Args:
-            code: error code.
-            detail: up to five manufacturer-specific bytes.
-            t_ns: current time, ns.
+            code: Error code.
+            detail: Up to five manufacturer-specific bytes.
+            t_ns: Current time, ns.
         """
         self._send_error(code, self.register | code.register_bit | 1, detail, t_ns)
         self._send_end(code, t_ns)
@@ -68,10 +68,10 @@ class EmcyProducer:
         """Report an error that lasts until :meth:`clear`. Repeated calls with the same detail have no effect.
 
         Args:
-            code: error code.
-            detail: up to five manufacturer-specific bytes.
-            t_ns: current time, ns.
-            who: number that distinguishes independent errors with the same code.
+            code: Error code.
+            detail: Up to five manufacturer-specific bytes.
+            t_ns: Current time, ns.
+            who: Number that distinguishes independent errors with the same code.
         """
         if self._present.get((code, who)) != detail:
             self._present[code, who] = detail
@@ -81,9 +81,9 @@ class EmcyProducer:
         """Report the end of an error. If the error is not active, do nothing.
 
         Args:
-            code: error code.
-            t_ns: current time, ns.
-            who: as in :meth:`report`.
+            code: Error code.
+            t_ns: Current time, ns.
+            who: As in :meth:`report`.
         """
         if self._present.pop((code, who), None) is not None:
             self._send_end(code, t_ns)

@@ -35,9 +35,9 @@ class ErrorControl:
     """Error control services of a node.
 
     Args:
-        services: resources that all services of the node share.
-        listen: callback for a change in the result of :meth:`handlers`.
-        failed: callback for a heartbeat event or life guarding event, given its time in ns.
+        services: Resources that all services of the node share.
+        listen: Callback for a change in the result of :meth:`handlers`.
+        failed: Callback for a heartbeat event or life guarding event, given its time in ns.
     """
 
     def __init__(

@@ -16,9 +16,9 @@ class Guarding:
     """Guarding slave: answers guarding requests and reports a life guarding event when they stop.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
         emcy: EMCY producer of the node.
-        failed: callback for a life guarding event, given its time in ns.
+        failed: Callback for a life guarding event, given its time in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -39,7 +39,7 @@ class Guarding:
 
         Args:
             state: NMT state of the node.
-            t_ns: arrival time of the request, ns.
+            t_ns: Arrival time of the request, ns.
         """
         answer = bytes((state | self._toggle,))
         self._toggle ^= GUARD_TOGGLE

@@ -32,8 +32,8 @@ class HeartbeatProducer:
         """Start the schedule. The first heartbeat is due one period after the boot-up message.
 
         Args:
-            period_ms: heartbeat period, ms; 0 for no heartbeats.
-            t_ns: time of the boot-up message, ns.
+            period_ms: Heartbeat period, ms; 0 for no heartbeats.
+            t_ns: Time of the boot-up message, ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
@@ -42,8 +42,8 @@ class HeartbeatProducer:
         """Change the heartbeat period. A heartbeat is due immediately.
 
         Args:
-            period_ms: heartbeat period, ms; 0 for no heartbeats.
-            t_ns: current time, ns.
+            period_ms: Heartbeat period, ms; 0 for no heartbeats.
+            t_ns: Current time, ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
@@ -70,9 +70,9 @@ class HeartbeatConsumer:
     """Monitors the nodes listed in 0x1016.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
         emcy: EMCY producer of the node.
-        failed: callback for a missed heartbeat, given its time in ns.
+        failed: Callback for a missed heartbeat, given its time in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -116,7 +116,7 @@ class HeartbeatConsumer:
         Args:
             node_id: node-ID of the monitored node.
             state: NMT state in the message.
-            t_ns: arrival time, ns.
+            t_ns: Arrival time, ns.
         """
         item = self._monitored[node_id]
         if state == NmtState.INITIALISING:

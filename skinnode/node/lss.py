@@ -49,12 +49,12 @@ class LssSlave:
 
     Args:
         address: LSS address, from the identity object (0x1018).
-        node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
-        bit_rates_bps: supported bit rates, bit/s; empty if the bit rate cannot be changed.
-        bit_rate_bps: stored bit rate, bit/s, or None.
-        store: function that stores the pending node-ID and bit rate (bit/s or None), or raises OSError; None
+        node_id: Persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
+        bit_rates_bps: Supported bit rates, bit/s; empty if the bit rate cannot be changed.
+        bit_rate_bps: Stored bit rate, bit/s, or None.
+        store: Function that stores the pending node-ID and bit rate (bit/s or None), or raises OSError; None
             if the node has no memory.
-        activate: function that starts a bit rate change, given the pending bit rate (bit/s or None) and the
+        activate: Function that starts a bit rate change, given the pending bit rate (bit/s or None) and the
             delay in ms; None if the bit rate cannot be changed. See :meth:`on_request`.
     """
 
@@ -119,7 +119,7 @@ class LssSlave:
         rate halfway. The second half gives the other nodes time to change their bit rates.
 
         Args:
-            data: payload of the frame.
+            data: Payload of the frame.
 
         Returns:
             The response, or None if there is none.
@@ -221,7 +221,7 @@ class BitRateChange:
     """Performs the bit rate change for *activate bit timing*, with a delay before and after the change.
 
     Args:
-        set_bit_rate: function that changes the bit rate (bit/s), or None if it cannot be changed.
+        set_bit_rate: Function that changes the bit rate (bit/s), or None if it cannot be changed.
     """
 
     def __init__(self, set_bit_rate: Callable[[int], None] | None) -> None:
@@ -235,9 +235,9 @@ class BitRateChange:
         """Start a bit rate change.
 
         Args:
-            bit_rate_bps: new bit rate, bit/s; None to keep the current bit rate.
-            delay_ms: delay in the request, ms.
-            t_ns: arrival time of the request, ns.
+            bit_rate_bps: New bit rate, bit/s; None to keep the current bit rate.
+            delay_ms: Delay in the request, ms.
+            t_ns: Arrival time of the request, ns.
         """
         self._bit_rate_bps = bit_rate_bps
         self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000

@@ -70,14 +70,14 @@ class Memory(Protocol):
         """Return the contents, or None if nothing has been saved.
 
         Raises:
-            MemoryFault: if the contents are not usable.
+            MemoryFault: If the contents are not usable.
         """
 
     def save(self, kept: Kept) -> None:
         """Replace the contents, and return once a power failure can no longer destroy the new contents.
 
         Raises:
-            OSError: if saving fails. The memory keeps its old contents.
+            OSError: If saving fails. The memory keeps its old contents.
         """
 
 
@@ -92,5 +92,5 @@ class VolatileMemory:
         return self._kept
 
     def save(self, kept: Kept) -> None:
-        """Replace the content."""
+        """Replace the contents."""
         self._kept = kept

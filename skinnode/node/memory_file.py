@@ -40,7 +40,7 @@ class FileMemory:
     appended to its name.
 
     Args:
-        path: path of the file; its folder must exist.
+        path: Path of the file; its folder must exist.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -52,8 +52,8 @@ class FileMemory:
         """Lock the file for exclusive access.
 
         Raises:
-            FileInUse: if this process or another process has locked the file.
-            OSError: if the file cannot be locked.
+            FileInUse: If this process or another process has locked the file.
+            OSError: If the file cannot be locked.
         """
         if self._release is None:
             lock = lock_file(self.path.with_name(f".{self.path.name[:200]}.lock"))
@@ -77,7 +77,7 @@ class FileMemory:
         """Return the contents, or None if the file does not exist.
 
         Raises:
-            MemoryFault: if the file cannot be read, or its contents are not usable.
+            MemoryFault: If the file cannot be read, or its contents are not usable.
         """
         try:
             return unpack(self._read())
@@ -92,11 +92,11 @@ class FileMemory:
         """Replace the contents, and return once the new contents are on disk.
 
         Args:
-            kept: new content.
+            kept: New contents.
 
         Raises:
-            FileInUse: if this process or another process has locked the file.
-            OSError: if the file cannot be written. The file keeps its old contents.
+            FileInUse: If this process or another process has locked the file.
+            OSError: If the file cannot be written. The file keeps its old contents.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -154,10 +154,10 @@ def unpack(data: bytes) -> Kept:
     """Return the contents of a memory file.
 
     Args:
-        data: bytes of the file.
+        data: Bytes of the file.
 
     Raises:
-        MemoryFault: if the file is damaged or has a different format.
+        MemoryFault: If the file is damaged or has a different format.
     """
     try:
         document = json.loads(data)

@@ -14,9 +14,9 @@ class NmtSlave:
     """NMT state machine of a node.
 
     Args:
-        store: object dictionary.
-        rejected: counters of rejected frames.
-        entered: callback for a state change; receives the new state, the previous state and the time in ns.
+        store: Object dictionary.
+        rejected: Counters of rejected frames.
+        entered: Callback for a state change; receives the new state, the previous state and the time in ns.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class NmtSlave:
         """Return the NMT command in a frame, or None if it is malformed or addresses another node.
 
         Args:
-            data: payload of the frame.
+            data: Payload of the frame.
             node_id: node-ID of this node.
         """
         try:

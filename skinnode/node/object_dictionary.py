@@ -48,7 +48,7 @@ class Lengths(NamedTuple):
         """Check the length of a complete value.
 
         Raises:
-            Refused: if the length is out of range.
+            Refused: If the length is out of range.
         """
         self.check_not_above(length)
         if length < self.least:
@@ -58,7 +58,7 @@ class Lengths(NamedTuple):
         """Check the length received so far of a value that may be incomplete.
 
         Raises:
-            Refused: if the length exceeds the maximum.
+            Refused: If the length exceeds the maximum.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
@@ -68,12 +68,12 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
     """Convert a value to the bytes that are sent on the bus.
 
     Args:
-        entry: declaration of the object.
-        value: value; bytes are returned unchanged.
+        entry: Declaration of the object.
+        value: Value; bytes are returned unchanged.
 
     Raises:
-        OverflowError: if the value does not fit in the integer type.
-        struct.error: if the value is not a number but the data type is REAL32.
+        OverflowError: If the value does not fit in the integer type.
+        struct.error: If the value is not a number but the data type is REAL32.
     """
     if isinstance(value, bytes):
         return value
@@ -91,7 +91,7 @@ class ObjectStore:
     node itself uses :meth:`raw`, :meth:`integer` and :meth:`put`, which require that the object exists.
 
     Args:
-        objects: declarations of all objects.
+        objects: Declarations of all objects.
         node_id: node-ID added to the default COB-IDs.
     """
 
@@ -115,9 +115,9 @@ class ObjectStore:
         """Register ``reader`` to compute the values of an object.
 
         Args:
-            index: index of the object.
-            reader: returns the bytes of a sub-index.
-            count: whether ``reader`` also computes sub-index 0 of an array or record.
+            index: Index of the object.
+            reader: Returns the bytes of a sub-index.
+            count: Whether ``reader`` also computes sub-index 0 of an array or record.
         """
         whole = count or (index, 1) not in self._entries
         for key in self._entries:
@@ -128,10 +128,10 @@ class ObjectStore:
         """Register functions that read and write a DOMAIN.
 
         Args:
-            index: index of the object.
-            length: length of the value, bytes.
-            reader: returns the value.
-            writer: stores the value.
+            index: Index of the object.
+            length: Length of the value, bytes.
+            reader: Returns the value.
+            writer: Stores the value.
         """
         self._readers[index, 0] = reader
         self._domains[index] = Lengths(length, length), writer
@@ -152,7 +152,7 @@ class ObjectStore:
         """Return the declaration of an object.
 
         Raises:
-            Refused: if the index or sub-index does not exist.
+            Refused: If the index or sub-index does not exist.
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
@@ -167,7 +167,7 @@ class ObjectStore:
         """Return the permitted lengths of the values that a client writes to an object.
 
         Raises:
-            Refused: if the object does not exist or is read-only.
+            Refused: If the object does not exist or is read-only.
         """
         entry = self.find(index, subindex)
         if entry.access in ("ro", "const"):
@@ -181,7 +181,7 @@ class ObjectStore:
         """Read an object for a client.
 
         Raises:
-            Refused: if the object does not exist or is write-only.
+            Refused: If the object does not exist or is write-only.
         """
         if self.find(index, subindex).access == "wo":
             raise Refused(AbortCode.WRITE_ONLY)
@@ -191,7 +191,7 @@ class ObjectStore:
         """Write an object for a client: check and store the value, then call the watcher.
 
         Raises:
-            Refused: if the object cannot be written or rejects the value.
+            Refused: If the object cannot be written or rejects the value.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:

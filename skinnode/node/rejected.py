@@ -34,7 +34,7 @@ class RejectedFrames:
     """Counters of rejected frames (0x2040). They stop at their maximum; *reset node* clears them.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
     """
 
     def __init__(self, store: ObjectStore) -> None:

@@ -43,10 +43,10 @@ class NodeRunner:
 
     Args:
         port: CAN port that the nodes share.
-        nodes: nodes to run.
+        nodes: Nodes to run.
 
     Raises:
-        ValueError: if there are no nodes or two nodes have the same node-ID.
+        ValueError: If there are no nodes or two nodes have the same node-ID.
     """
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
@@ -95,7 +95,7 @@ class NodeRunner:
         """Power the nodes off and end the thread. Repeated calls have no effect.
 
         Raises:
-            BaseException: the error that ended the thread, if any.
+            BaseException: The error that ended the thread, if any.
         """
         if self._stopped:
             return

@@ -40,10 +40,10 @@ class Storage:
     :class:`~skinnode.node.memory.Fault`.
 
     Args:
-        services: resources that all services of the node share.
-        memory: memory of the node, or None. Without a memory, 0x1010 and 0x1011 read as 0 and refuse writes
+        services: Resources that all services of the node share.
+        memory: Memory of the node, or None. Without a memory, 0x1010 and 0x1011 read as 0 and refuse writes
             (CiA 301).
-        patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
+        patch: Sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """
 
     def __init__(self, services: NodeServices, memory: Memory | None, patch: str) -> None:
@@ -97,10 +97,10 @@ class Storage:
         """Record a fault for :meth:`report`.
 
         Args:
-            fault: type of the fault.
-            index: index of the refused parameter, if any.
-            subindex: sub-index of the refused parameter, if any.
-            why: one-line description; by default, a description of the refused parameter.
+            fault: Type of the fault.
+            index: Index of the refused parameter, if any.
+            subindex: Sub-index of the refused parameter, if any.
+            why: One-line description; by default, a description of the refused parameter.
         """
         self.problem = why or f"the stored value of 0x{index:04X}:{subindex} is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
@@ -154,10 +154,10 @@ class Storage:
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
-            bit_rate_bps: bit rate, bit/s; None if LSS has not configured one.
+            bit_rate_bps: Bit rate, bit/s; None if LSS has not configured one.
 
         Raises:
-            OSError: if saving fails.
+            OSError: If saving fails.
         """
         self._keep(replace(self._kept, node_id=node_id, bit_rate_bps=bit_rate_bps))
 

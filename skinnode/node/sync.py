@@ -54,8 +54,8 @@ class SyncWindow:
         within the window.
 
         Args:
-            number: number of the TPDO, counted from 0.
-            t_ns: current time, ns.
+            number: Number of the TPDO, counted from 0.
+            t_ns: Current time, ns.
         """
         if self.is_open(t_ns):
             self._clear(number, t_ns)
@@ -77,7 +77,7 @@ class Sync:
     like one accepted by :meth:`accept`.
 
     Args:
-        services: resources that all services of the node share.
+        services: Resources that all services of the node share.
     """
 
     def __init__(self, services: NodeServices) -> None:
@@ -153,8 +153,8 @@ class Sync:
         A wrong length is reported in an emergency message, but not again while it stays the same.
 
         Args:
-            message: payload of the SYNC.
-            t_ns: arrival time, ns.
+            message: Payload of the SYNC.
+            t_ns: Arrival time, ns.
         """
         counted = self._overflow > 0
         if len(message) == counted:

@@ -29,8 +29,8 @@ class TimeConsumer:
     """TIME consumer of a node. The object 0x2022 contains the current time of day.
 
     Args:
-        store: object dictionary.
-        now: function that returns the time of the event being handled in ns.
+        store: Object dictionary.
+        now: Function that returns the time of the event being handled in ns.
     """
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
@@ -52,8 +52,8 @@ class TimeConsumer:
         """Process a TIME message.
 
         Args:
-            data: payload of the frame.
-            t_ns: arrival time, ns.
+            data: Payload of the frame.
+            t_ns: Arrival time, ns.
 
         Returns:
             Whether the payload is a valid time of day. An invalid payload is ignored.

@@ -27,8 +27,8 @@ class Timers:
         """Set, change or cancel a timer.
 
         Args:
-            key: number of the timer.
-            t_ns: time at which the timer is due, ns; NO_DEADLINE_NS to cancel it.
+            key: Number of the timer.
+            t_ns: Time at which the timer is due, ns; NO_DEADLINE_NS to cancel it.
         """
         if t_ns == NO_DEADLINE_NS:
             self._due.pop(key, None)

@@ -27,8 +27,8 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
     PDOs are disabled while their parameters are written, and EMCY is disabled before its COB-ID is written.
 
     Args:
-        store: object dictionary.
-        values: saved bytes, by index and sub-index.
+        store: Object dictionary.
+        values: Saved bytes, by index and sub-index.
 
     Returns:
         Objects that refused their values and keep their defaults. A mapping that has a refused entry keeps

@@ -67,19 +67,19 @@ class ScanAssembler:
     the frame returns the first scan and ``poll`` returns the second.
 
     Args:
-        profile: sizes of the patch.
-        counter_overflow: synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
+        profile: Sizes of the patch.
+        counter_overflow: Synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
             the patch counts its own scans from 0 to 255.
-        period_ns: scan period, ns. The timeout is a multiple of this period.
-        grace_ns: maximum time (ns) to wait for the remaining frames after the summary, or after all chunks of
+        period_ns: Scan period, ns. The timeout is a multiple of this period.
+        grace_ns: Maximum time (ns) to wait for the remaining frames after the summary, or after all chunks of
             a full scan, has arrived.
         node_id: node-ID for the COB-IDs in the errors passed to ``on_reject``.
-        on_reject: callback that receives a CodecError for each frame with a wrong length, and for each
+        on_reject: Callback that receives a CodecError for each frame with a wrong length, and for each
             summary that lacks a required check.
-        under_way: whether the node may already be sending scans; see :meth:`reset`.
+        under_way: Whether the node may already be sending scans; see :meth:`reset`.
 
     Raises:
-        ConfigError: if ``counter_overflow`` is neither 0 nor 2 to 240, or a time is not positive.
+        ConfigError: If ``counter_overflow`` is neither 0 nor 2 to 240, or a time is not positive.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, each given alone by some caller
@@ -144,8 +144,8 @@ class ScanAssembler:
         """Process a chunk.
 
         Args:
-            data: payload of TPDO1. The assembler keeps a reference to this object.
-            t_ns: arrival time, ns.
+            data: Payload of TPDO1. The assembler keeps a reference to this object.
+            t_ns: Arrival time, ns.
 
         Returns:
             The scan that this chunk closed, or None.
@@ -170,8 +170,8 @@ class ScanAssembler:
         """Process a summary.
 
         Args:
-            data: payload of TPDO2.
-            t_ns: arrival time, ns.
+            data: Payload of TPDO2.
+            t_ns: Arrival time, ns.
 
         Returns:
             The scan that this summary closed, or None.
@@ -208,7 +208,7 @@ class ScanAssembler:
         """If the missing frames of the open scan have timed out, close the scan and return it.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         deadline = self.next_deadline_ns()
         return self._close() if deadline is not None and t_ns >= deadline else None
@@ -230,9 +230,9 @@ class ScanAssembler:
         """Discard the open scan, the stored codes and the scan counter, for example after a boot-up message.
 
         Args:
-            under_way: whether the node may already be sending scans. If so, the first scan is discarded if
+            under_way: Whether the node may already be sending scans. If so, the first scan is discarded if
                 its beginning was missed, and its missing chunks are not counted as lost.
-            checked: whether every summary must contain a check. If false, checks become mandatory as soon as
+            checked: Whether every summary must contain a check. If false, checks become mandatory as soon as
                 one has passed.
         """
         if self._counter != _NONE_OPEN:

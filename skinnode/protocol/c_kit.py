@@ -71,8 +71,8 @@ def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[
     """Return the contents of the kit's files, by file name.
 
     Args:
-        profile: sizes of the patch.
-        layout: electrodes of the patch; None if only the sizes are known.
+        profile: Sizes of the patch.
+        layout: Electrodes of the patch; None if only the sizes are known.
     """
     folder = resources.files(__package__) / "c"
     fixed = {name: (folder / name).read_text(encoding="ascii") for name in FIXED_NAMES}
@@ -83,10 +83,10 @@ def may_replace(file: Path) -> bool:
     """Return whether a kit file may be written: it does not exist yet or begins with :data:`MARK`.
 
     Args:
-        file: path of the file.
+        file: Path of the file.
 
     Raises:
-        OSError: if the file exists but cannot be read.
+        OSError: If the file exists but cannot be read.
     """
     if not file.exists():
         return True
@@ -100,8 +100,8 @@ def config_header(profile: PatchProfile, layout: PatchLayout | None = None) -> s
     """Return the contents of ``skinnode_patch_config.h``, which depends only on the arguments.
 
     Args:
-        profile: sizes of the patch.
-        layout: electrodes of the patch; None if only the sizes are known.
+        profile: Sizes of the patch.
+        layout: Electrodes of the patch; None if only the sizes are known.
     """
     bus = "PDO over CAN FD" if profile.bus == "fd" else "classic CAN"
     sizes = f"{profile.rows} x {profile.columns} wires with {profile.code_bits}-bit codes on {bus}"

@@ -34,13 +34,13 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
     """Pack the payload of TPDO1.
 
     Args:
-        chunk: chunk index, 0 to 255.
-        scan: scan counter, 0 to 255.
-        codes: up to 3 codes of 16 bits, or 2 of 24 bits; unused bytes are set to 0.
-        bits: width of a code, 16 or 24.
+        chunk: Chunk index, 0 to 255.
+        scan: Scan counter, 0 to 255.
+        codes: Up to 3 codes of 16 bits, or 2 of 24 bits; unused bytes are set to 0.
+        bits: Width of a code, 16 or 24.
 
     Raises:
-        ValueError: if a value does not fit in its field or there are too many codes.
+        ValueError: If a value does not fit in its field or there are too many codes.
     """
     width = bits // 8
     if not (0 <= chunk <= 255 and 0 <= scan <= 255):
@@ -58,12 +58,12 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
     """Unpack the payload of TPDO1.
 
     Args:
-        data: payload of the frame.
-        bits: width of a code, 16 or 24.
+        data: Payload of the frame.
+        bits: Width of a code, 16 or 24.
         cob_id: COB-ID for the error message.
 
     Raises:
-        CodecError: if the payload is not 8 bytes long.
+        CodecError: If the payload is not 8 bytes long.
     """
     require_length(data, PDO_BYTES, cob_id, "chunk")
     width = bits // 8
@@ -78,12 +78,12 @@ def pack_scan(
 
     Args:
         codes: (U, K) codes.
-        scan: scan counter, 0 to 255.
-        profile: sizes of the patch.
-        only: chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
+        scan: Scan counter, 0 to 255.
+        profile: Sizes of the patch.
+        only: Chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
 
     Raises:
-        ValueError: if the shape is wrong or a code to pack has more bits than ``profile`` allows.
+        ValueError: If the shape is wrong or a code to pack has more bits than ``profile`` allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
@@ -127,8 +127,8 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
     """Return the (U, K) codes of a scan, given the payloads of its chunks.
 
     Args:
-        frames: payloads of all chunks in ascending order, concatenated.
-        profile: sizes of the patch.
+        frames: Payloads of all chunks in ascending order, concatenated.
+        profile: Sizes of the patch.
     """
     return unpack_scan_with_check(frames, profile)[0]
 
@@ -137,8 +137,8 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
     """Return the codes of a scan and the CRC over them.
 
     Args:
-        frames: payloads of all chunks in ascending order, concatenated.
-        profile: sizes of the patch.
+        frames: Payloads of all chunks in ascending order, concatenated.
+        profile: Sizes of the patch.
 
     Returns:
         (U, K) codes, and the CRC over them (:func:`~skinnode.protocol.scan_check.check_of_codes`).

@@ -35,7 +35,7 @@ class CodeScale:
     """Mapping of R/R0 to codes. ``lo`` and ``hi`` are rounded to REAL32, as in the object dictionary.
 
     Raises:
-        ConfigError: if the code width is neither 16 nor 24 bits, or 0 ≤ lo < hi < ∞ does not hold.
+        ConfigError: If the code width is neither 16 nor 24 bits, or 0 ≤ lo < hi < ∞ does not hold.
     """
 
     bits: int = 16
@@ -114,9 +114,9 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     and finite.
 
     Args:
-        resistance_ohm: resistances, ohm; any shape.
+        resistance_ohm: Resistances, ohm; any shape.
         baseline_ohm: R0, ohm; broadcastable to the shape of the resistances.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
 
     Returns:
         Codes with the same shape as ``resistance_ohm``.
@@ -146,9 +146,9 @@ def _all_measured(code: Float, distance: Float, scale: CodeScale) -> bool:
     are positive and finite.
 
     Args:
-        code: rounded positions in the code range; any shape.
-        distance: distance of each position from its code, in codes.
-        scale: mapping of R/R0 to codes.
+        code: Rounded positions in the code range; any shape.
+        distance: Distance of each position from its code, in codes.
+        scale: Mapping of R/R0 to codes.
     """
     if not code.size or scale.lo < scale.step:
         return False
@@ -165,11 +165,11 @@ def _round_exactly(
     """Return the codes, rounded in exact arithmetic where they are near a tie.
 
     Args:
-        code: rounded positions in the code range; any shape.
-        near_tie: mask of the positions that cannot be rounded reliably in double precision.
-        resistance: resistances, ohm; broadcastable to the shape of ``code``.
+        code: Rounded positions in the code range; any shape.
+        near_tie: Mask of the positions that cannot be rounded reliably in double precision.
+        resistance: Resistances, ohm; broadcastable to the shape of ``code``.
         baseline: R0, ohm; broadcastable to the shape of ``code``.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
     """
     exact = np.array(code)
     lo, steps_per_ratio = Fraction(scale.lo), scale.steps / (Fraction(scale.hi) - Fraction(scale.lo))
@@ -184,9 +184,9 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
     """Decode codes into resistances.
 
     Args:
-        codes: codes of any shape, which may include :data:`MISSING`.
+        codes: Codes of any shape, which may include :data:`MISSING`.
         baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
 
     Returns:
         Resistances in ohms, and a mask of the valid resistances, both with the shape of ``codes``. Where the
@@ -201,7 +201,7 @@ class Decoder:
 
     Args:
         baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
     """
 
     def __init__(self, baseline_ohm: ArrayLike, scale: CodeScale) -> None:
@@ -213,7 +213,7 @@ class Decoder:
         """Decode codes into resistances.
 
         Args:
-            codes: codes, which may include :data:`MISSING`.
+            codes: Codes, which may include :data:`MISSING`.
 
         Returns:
             Resistances in ohms, and a mask of the valid resistances.

@@ -20,8 +20,8 @@ def restore_time_us(low_us: int, expected_us: int) -> int:
     """Return the device time (µs) with the given low bits that is nearest to the expected time.
 
     Args:
-        low_us: device time (µs) without its upper bits, from a summary with a check.
-        expected_us: expected device time, µs.
+        low_us: Device time (µs) without its upper bits, from a summary with a check.
+        expected_us: Expected device time, µs.
     """
     return expected_us + (low_us - expected_us + TIME_WRAP_US // 2) % TIME_WRAP_US - TIME_WRAP_US // 2
 
@@ -46,8 +46,8 @@ class DeviceTimeTracker:
         seconds of its scan.
 
         Args:
-            low_us: device time (µs) without its upper bits, from a summary with a check.
-            t_ns: arrival time of the summary on the host's monotonic clock, ns.
+            low_us: Device time (µs) without its upper bits, from a summary with a check.
+            t_ns: Arrival time of the summary on the host's monotonic clock, ns.
         """
         expected_us = self._time_us + (t_ns - self._t_time_ns) // 1000
         if not self._t_time_ns:

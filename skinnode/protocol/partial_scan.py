@@ -16,7 +16,7 @@ class HeldChunks:
     """Last known payloads of all chunks of a patch.
 
     Args:
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
     """
 
     def __init__(self, profile: PatchProfile) -> None:
@@ -34,8 +34,8 @@ class HeldChunks:
         """Store the payloads of a closed scan.
 
         Args:
-            received: payload of each chunk; None for a chunk that did not arrive.
-            carry: whether chunks that did not arrive are unchanged and keep their last payloads.
+            received: Payload of each chunk; None for a chunk that did not arrive.
+            carry: Whether chunks that did not arrive are unchanged and keep their last payloads.
         """
         if carry and None in received:
             held = self._payloads

@@ -15,13 +15,13 @@ def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
     """Check the length of a payload.
 
     Args:
-        data: payload of the frame.
-        length: required length, bytes.
+        data: Payload of the frame.
+        length: Required length, bytes.
         cob_id: COB-ID for the error message.
-        what: name of the payload for the error message.
+        what: Name of the payload for the error message.
 
     Raises:
-        CodecError: if the payload does not have the required length.
+        CodecError: If the payload does not have the required length.
     """
     if len(data) != length:
         raise CodecError(cob_id, data, f"{counted(length, 'byte')} ({what})")

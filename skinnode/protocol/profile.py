@@ -46,7 +46,7 @@ class PatchProfile:
     """Sizes of a patch and its wire format.
 
     Raises:
-        ConfigError: if a number of wires, electrodes or PDOs is out of range; if the code width is neither 16
+        ConfigError: If a number of wires, electrodes or PDOs is out of range; if the code width is neither 16
             nor 24 bits; or if a scan on classic CAN would have more than 256 chunks.
     """
 
@@ -98,9 +98,9 @@ class PatchProfile:
         """Return the profile of a patch that has the electrodes in ``layout``.
 
         Args:
-            layout: electrodes of the patch.
-            code_bits: width of a code in bits, 16 or 24.
-            bus: frame format of PDOs.
+            layout: Electrodes of the patch.
+            code_bits: Width of a code in bits, 16 or 24.
+            bus: Frame format of PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]
         columns, lower_electrodes = layout.lower_m.shape[:2]

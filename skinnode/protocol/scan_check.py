@@ -19,7 +19,7 @@ def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
 
     Args:
         codes: (U, K) codes of all chunks, including those not sent in this scan.
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
     """
     if profile.code_bits == 16:
         return binascii.crc_hqx(codes.astype("<u2").tobytes(), CRC_INITIAL)
@@ -45,7 +45,7 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
     other errors, one in 65,536 goes undetected.
 
     Args:
-        check_of_codes: result of :func:`check_of_codes`.
-        head: the first 6 bytes of the summary.
+        check_of_codes: Result of :func:`check_of_codes`.
+        head: The first 6 bytes of the summary.
     """
     return binascii.crc_hqx(head, check_of_codes)

@@ -50,6 +50,6 @@ def pack_self_test(test: SelfTest) -> bytes:
     """Return the contents of record 0x2023 after a self-test.
 
     Args:
-        test: findings of the self-test, which passes if there are no faults.
+        test: Findings of the self-test, which passes if there are no faults.
     """
     return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)

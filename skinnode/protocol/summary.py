@@ -80,13 +80,13 @@ def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> byt
     """Pack a summary without a check into the payload of TPDO2, for a revision 1.0 patch.
 
     Args:
-        scan: scan counter, 0 to 255.
-        flags: bits of :class:`SummaryFlag` without ``CHECKED``.
-        chunks: number of chunks sent in this scan.
-        device_time_us: time on the node's clock in µs; wraps at 2³².
+        scan: Scan counter, 0 to 255.
+        flags: Bits of :class:`SummaryFlag` without ``CHECKED``.
+        chunks: Number of chunks sent in this scan.
+        device_time_us: Time on the node's clock in µs; wraps at 2³².
 
     Raises:
-        ValueError: if the scan counter, the flags or the number of chunks does not fit in its field.
+        ValueError: If the scan counter, the flags or the number of chunks does not fit in its field.
     """
     try:
         return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
@@ -100,15 +100,15 @@ def pack_checked_summary(
     """Pack a summary with a check into the payload of TPDO2 and set :attr:`SummaryFlag.CHECKED`.
 
     Args:
-        scan: scan counter, 0 to 255.
-        flags: bits of :class:`SummaryFlag`.
-        chunks: number of chunks sent in this scan.
-        device_time_us: time on the node's clock in µs; wraps at 2³².
-        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for all codes after
+        scan: Scan counter, 0 to 255.
+        flags: Bits of :class:`SummaryFlag`.
+        chunks: Number of chunks sent in this scan.
+        device_time_us: Time on the node's clock in µs; wraps at 2³².
+        check_of_codes: Result of :func:`~skinnode.protocol.scan_check.check_of_codes` for all codes after
             this scan, including those of unsent chunks.
 
     Raises:
-        ValueError: if the scan counter, the flags or the number of chunks does not fit in its field.
+        ValueError: If the scan counter, the flags or the number of chunks does not fit in its field.
     """
     steps = device_time_us >> TIME_SHIFT & 0xFFFF
     try:
@@ -124,8 +124,8 @@ def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
     In a summary with a check, the full device time is inserted before the 16-bit device time.
 
     Args:
-        payload: the payload of TPDO2.
-        device_time_us: time on the node's clock in µs; wraps at 2³².
+        payload: The payload of TPDO2.
+        device_time_us: Time on the node's clock in µs; wraps at 2³².
     """
     if not payload[1] & _CHECKED:
         return payload
@@ -136,11 +136,11 @@ def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
     """Unpack a summary (with or without a check) from the payload of TPDO2.
 
     Args:
-        data: payload of the frame.
+        data: Payload of the frame.
         cob_id: COB-ID for the error message.
 
     Raises:
-        CodecError: if the payload is not 8 bytes long.
+        CodecError: If the payload is not 8 bytes long.
     """
     require_length(data, PDO_BYTES, cob_id, "scan summary")
     scan, flags, chunks, rest = _SUMMARY.unpack(data)

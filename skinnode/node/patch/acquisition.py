@@ -24,13 +24,13 @@ class Acquisition:
     """Baseline of a patch, and the codes of its last scan.
 
     Args:
-        profile: sizes of the patch.
-        source: analogue port of the patch.
-        scale: mapping of R/R0 to codes.
+        profile: Sizes of the patch.
+        source: Analogue port of the patch.
+        scale: Mapping of R/R0 to codes.
         baseline_ohm: (U, K) initial R0, ohm; None if the patch has no baseline yet.
 
     Raises:
-        ValueError: if the baseline has the wrong shape or a negative value.
+        ValueError: If the baseline has the wrong shape or a negative value.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Acquisition:
         """Read the source once and return (U, K) resistances in ohms.
 
         Raises:
-            SourceFailed: if the source returns no valid reading.
+            SourceFailed: If the source returns no valid reading.
         """
         return read_source(self._source, (self.profile.rows, self.profile.columns), t_ns)
 
@@ -70,11 +70,11 @@ class Acquisition:
         """Take a scan: read the source and encode the mean of the readings.
 
         Args:
-            t_ns: current time, ns.
-            readings: number of readings.
+            t_ns: Current time, ns.
+            readings: Number of readings.
 
         Raises:
-            SourceFailed: if the source returns no valid reading.
+            SourceFailed: If the source returns no valid reading.
         """
         resistance = self._total(t_ns, readings)
         conversions = conversions_of(self._source)
@@ -103,11 +103,11 @@ class Acquisition:
         Crossings without a valid resistance keep their R0.
 
         Args:
-            t_ns: current time, ns.
-            readings: number of readings to average.
+            t_ns: Current time, ns.
+            readings: Number of readings to average.
 
         Raises:
-            SourceFailed: if the source returns no valid reading.
+            SourceFailed: If the source returns no valid reading.
         """
         with np.errstate(over="ignore", under="ignore"):  # a resistance outside the REAL32 range is invalid
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)

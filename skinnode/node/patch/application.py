@@ -42,11 +42,11 @@ class PatchApplication:
     """Application of one patch; implements :class:`~skinnode.node.application.Application`.
 
     Args:
-        layout: electrodes of the patch.
-        serial: serial number (0x2000:11), u32.
-        acquisition: source of the codes and the baseline.
-        services: services of the device.
-        pacing: timer precision of the node, which determines how chunks are paced.
+        layout: Electrodes of the patch.
+        serial: Serial number (0x2000:11), u32.
+        acquisition: Source of the codes and the baseline.
+        services: Services of the device.
+        pacing: Timer precision of the node, which determines how chunks are paced.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class PatchApplication:
         """Load the baseline from the memory, or tare if there is no baseline.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         remembered = self._remembered()
         if remembered is not None:
@@ -136,8 +136,8 @@ class PatchApplication:
 
         Args:
             counter: SYNC counter; None if the SYNC contains no counter.
-            turns: numbers of the synchronous TPDOs that are due.
-            t_ns: arrival time of the SYNC, ns.
+            turns: Numbers of the synchronous TPDOs that are due.
+            t_ns: Arrival time of the SYNC, ns.
         """
         scans = not self._period_ns
         if not scans or self.stream.full:  # this SYNC does not start a scan

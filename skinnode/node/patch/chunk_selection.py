@@ -13,8 +13,8 @@ class ChunkSelection:
     """Selects the chunks whose codes have changed since they were last sent.
 
     Args:
-        profile: sizes of the patch.
-        scale: mapping of R/R0 to codes.
+        profile: Sizes of the patch.
+        scale: Mapping of R/R0 to codes.
     """
 
     def __init__(self, profile: PatchProfile, scale: CodeScale) -> None:
@@ -38,8 +38,8 @@ class ChunkSelection:
 
         Args:
             codes: (U, K) codes of the scan.
-            threshold: largest code change that is not sent.
-            full_every: interval between full scans, in scans; 0 for no regular full scans.
+            threshold: Largest code change that is not sent.
+            full_every: Interval between full scans, in scans; 0 for no regular full scans.
 
         Returns:
             Numbers of the chunks in ascending order, or None if a full scan is due.

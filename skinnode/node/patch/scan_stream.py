@@ -63,10 +63,10 @@ class ScanStream:
     """Sends the scans of a patch.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
         tpdos: TPDO engine of the node.
-        chunk: initial contents of the chunk record (0x2010).
-        catch_up_ns: maximum delay, in ns, that the stream makes up by sending later chunks sooner.
+        chunk: Initial contents of the chunk record (0x2010).
+        catch_up_ns: Maximum delay, in ns, that the stream makes up by sending later chunks sooner.
     """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
@@ -144,8 +144,8 @@ class ScanStream:
         """Send a scan, immediately or after the current scan. :attr:`full` must be false.
 
         Args:
-            scan: scan to send.
-            t_ns: current time, ns.
+            scan: Scan to send.
+            t_ns: Current time, ns.
         """
         if self._scan is None:
             self._busy_ns, self._paced_ns = t_ns, 0

@@ -34,9 +34,9 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
     """Run a self-test.
 
     Args:
-        read: function that returns (U, K) resistances in ohms or raises SourceFailed.
+        read: Function that returns (U, K) resistances in ohms or raises SourceFailed.
         baseline_ohm: (U, K) R0, ohm.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
 
     Returns:
         Findings of the self-test.

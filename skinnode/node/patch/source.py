@@ -28,7 +28,7 @@ class ResistanceSource(Protocol):
         tries again at the next scan.
 
         Args:
-            t_ns: current time on the monotonic clock, ns.
+            t_ns: Current time on the monotonic clock, ns.
         """
         ...
 
@@ -37,7 +37,7 @@ def conversions_of(source: ResistanceSource) -> int | None:
     """Return the number of conversions of a source, or None if the source does not count them.
 
     Raises:
-        SourceFailed: if the attribute raises an exception or is not an integer.
+        SourceFailed: If the attribute raises an exception or is not an integer.
     """
     try:
         count = getattr(source, "conversions", None)
@@ -69,15 +69,15 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
     """Read a source and check the reading.
 
     Args:
-        source: source to read.
-        shape: shape of the reading, (U, K).
-        t_ns: current time, ns.
+        source: Source to read.
+        shape: Shape of the reading, (U, K).
+        t_ns: Current time, ns.
 
     Returns:
         Copy of the resistances in ohms, (U, K) float64.
 
     Raises:
-        SourceFailed: if the source raises an exception or does not return an array of numbers with the
+        SourceFailed: If the source raises an exception or does not return an array of numbers with the
             required shape. The message is a single line.
     """
     try:

@@ -16,7 +16,7 @@ class SourceMonitor:
 
     Args:
         emcy: EMCY producer of the node.
-        on_failure: callback for each failure.
+        on_failure: Callback for each failure.
     """
 
     def __init__(self, emcy: EmcyProducer, on_failure: Callable[[], None]) -> None:
@@ -40,7 +40,7 @@ class SourceMonitor:
         failure is reported.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         try:
             yield

@@ -61,7 +61,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
     Args:
         codes: (U, K) codes.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
     """
     if codes.max() < scale.short:  # the usual case
         return _no_faults((codes.shape[0], codes.shape[1]))
@@ -73,7 +73,7 @@ class WireFaultReporter:
     """Sends emergency messages when wire faults begin and end.
 
     Args:
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
         emcy: EMCY producer of the node.
     """
 
@@ -92,8 +92,8 @@ class WireFaultReporter:
         message. It contains the type and wire number of the first new fault, and the number of faulty wires.
 
         Args:
-            faults: current wire faults.
-            t_ns: current time, ns.
+            faults: Current wire faults.
+            t_ns: Current time, ns.
         """
         reported, self._reported = self._reported, faults
         if not faults.any:

@@ -48,11 +48,11 @@ def check_cob_id(value: int, current: int) -> None:
     """Check a COB-ID written by a client.
 
     Args:
-        value: new COB-ID, with its flag bits.
-        current: current COB-ID, with its flag bits.
+        value: New COB-ID, with its flag bits.
+        current: Current COB-ID, with its flag bits.
 
     Raises:
-        Refused: if the new COB-ID is malformed, if its CAN-ID is restricted, or if it would change the CAN-ID
+        Refused: If the new COB-ID is malformed, if its CAN-ID is restricted, or if it would change the CAN-ID
             of an enabled service.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
@@ -109,11 +109,11 @@ class PdoRecords:
     """Communication record and mapping record of a PDO. Writes by clients are checked.
 
     Args:
-        store: object dictionary.
-        parameter: index of the communication record.
-        mapping: index of the mapping record.
-        transmits: whether the PDO is a TPDO.
-        taken: function that returns whether a PDO uses a CAN-ID; None if PDOs are allowed to share CAN-IDs.
+        store: Object dictionary.
+        parameter: Index of the communication record.
+        mapping: Index of the mapping record.
+        transmits: Whether the PDO is a TPDO.
+        taken: Function that returns whether a PDO uses a CAN-ID; None if PDOs are allowed to share CAN-IDs.
     """
 
     def __init__(

@@ -55,9 +55,9 @@ class RpdoEngine:
     """Receives the RPDOs of a node.
 
     Args:
-        services: resources that all services of the node share.
-        count: number of RPDOs.
-        window: synchronous window of the node.
+        services: Resources that all services of the node share.
+        count: Number of RPDOs.
+        window: Synchronous window of the node.
     """
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
@@ -133,9 +133,9 @@ class RpdoEngine:
         """Handle a frame, which may belong to several RPDOs.
 
         Args:
-            cob_id: identifier of the frame.
-            data: payload of the frame.
-            t_ns: arrival time, ns.
+            cob_id: Identifier of the frame.
+            data: Payload of the frame.
+            t_ns: Arrival time, ns.
         """
         if self._operational:
             for rpdo in tuple(self._by_cob_id.get(cob_id, ())):

@@ -38,8 +38,8 @@ class Tpdo:
     """Parameters and state of one TPDO.
 
     Args:
-        number: number of the TPDO, counted from 0.
-        records: records of the TPDO in the object dictionary.
+        number: Number of the TPDO, counted from 0.
+        records: Records of the TPDO in the object dictionary.
     """
 
     def __init__(self, number: int, records: PdoRecords) -> None:
@@ -138,9 +138,9 @@ class TpdoEngine:
     """Sends the TPDOs of a node.
 
     Args:
-        services: resources that all services of the node share.
-        count: number of TPDOs.
-        window: synchronous window of the node.
+        services: Resources that all services of the node share.
+        count: Number of TPDOs.
+        window: Synchronous window of the node.
     """
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
@@ -249,8 +249,8 @@ class TpdoEngine:
         The application must already have handled the SYNC.
 
         Args:
-            turns: numbers of the synchronous TPDOs that are due.
-            t_ns: arrival time of the SYNC, ns.
+            turns: Numbers of the synchronous TPDOs that are due.
+            t_ns: Arrival time of the SYNC, ns.
         """
         for number in tuple(self._listening):
             tpdo = self._tpdos[number]

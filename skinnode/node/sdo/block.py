@@ -81,12 +81,12 @@ class BlockUpload(Transfer):
 
     Args:
         channel: SDO server channel.
-        target: object to read.
-        upload: value and options.
-        t_ns: arrival time of the initiate request, ns.
+        target: Object to read.
+        upload: Value and options.
+        t_ns: Arrival time of the initiate request, ns.
 
     Raises:
-        Refused: if the block size is not in the range 1 to 127.
+        Refused: If the block size is not in the range 1 to 127.
     """
 
     def __init__(self, channel: Channel, target: Target, upload: Upload, t_ns: int) -> None:
@@ -180,13 +180,13 @@ class BlockDownload(Transfer):
 
     Args:
         channel: SDO server channel.
-        target: object to write.
-        announced: size in bytes announced by the client, or None.
-        t_ns: arrival time of the initiate request, ns.
-        crc: whether the client supports a CRC.
+        target: Object to write.
+        announced: Size in bytes announced by the client, or None.
+        t_ns: Arrival time of the initiate request, ns.
+        crc: Whether the client supports a CRC.
 
     Raises:
-        Refused: if the object is not writable or rejects the announced size.
+        Refused: If the object is not writable or rejects the announced size.
     """
 
     def __init__(

@@ -46,9 +46,9 @@ class SdoServer:
     exception from ``send`` propagates to the caller and does not end the transfer.
 
     Args:
-        store: object dictionary.
-        send: function that sends a response of eight bytes.
-        timeout_ns: maximum time to wait for a client's next request, ns.
+        store: Object dictionary.
+        send: Function that sends a response of eight bytes.
+        timeout_ns: Maximum time to wait for a client's next request, ns.
     """
 
     def __init__(
@@ -79,8 +79,8 @@ class SdoServer:
         """Handle a request.
 
         Args:
-            request: payload of eight bytes.
-            t_ns: arrival time, ns.
+            request: Payload of eight bytes.
+            t_ns: Arrival time, ns.
         """
         transfer = self._transfer
         if request[0] == ABORT:

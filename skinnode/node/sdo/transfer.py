@@ -44,8 +44,8 @@ class Transfer(ABC):
 
     Args:
         channel: SDO server channel.
-        target: object to read or write.
-        t_ns: arrival time of the initiate request, ns.
+        target: Object to read or write.
+        t_ns: Arrival time of the initiate request, ns.
     """
 
     def __init__(self, channel: Channel, target: Target, t_ns: int) -> None:
@@ -67,7 +67,7 @@ class Transfer(ABC):
         """Abort the transfer because it has timed out. Overridden if the transfer has other timer events.
 
         Raises:
-            Refused: always.
+            Refused: Always.
         """
         raise Refused(AbortCode.TIMED_OUT)
 
@@ -79,12 +79,12 @@ class Incoming:
     """Value of a download, received in parts and then written to the object as a whole.
 
     Args:
-        store: object dictionary.
-        target: object to read or write.
-        announced: size in bytes announced by the client, or None.
+        store: Object dictionary.
+        target: Object to read or write.
+        announced: Size in bytes announced by the client, or None.
 
     Raises:
-        Refused: if the object is not writable or rejects the announced size.
+        Refused: If the object is not writable or rejects the announced size.
     """
 
     def __init__(self, store: ObjectStore, target: Target, announced: int | None) -> None:
@@ -100,7 +100,7 @@ class Incoming:
         """Append a part of the value.
 
         Raises:
-            Refused: if the value is too long.
+            Refused: If the value is too long.
         """
         self.data += part
         self._lengths.check_not_above(len(self.data))
@@ -111,7 +111,7 @@ class Incoming:
         """Write the complete value to the object.
 
         Raises:
-            Refused: if the value is too short or the object rejects it.
+            Refused: If the value is too short or the object rejects it.
         """
         if self._announced is not None and len(self.data) < self._announced:
             raise Refused(AbortCode.TOO_SHORT)

@@ -18,7 +18,7 @@ class Tolerances:
     placement: float = 0.0
     """Position of each upper and lower wire along each axis, in pitches."""
     thickness: float = 0.0
-    """Rubber thickness between upper and lower electrodes, as a fraction of their smallest distance."""
+    """Rubber thickness between upper and lower electrodes, relative to the smallest distance between them."""
     electrode_radius: float = 0.0
     """Radius of the electrodes, in pitches; the forward model assumes point electrodes."""
     gain: float = 0.0

@@ -43,7 +43,7 @@ HELP: Final = """\
  z, enter          show that patch alone, or all (also esc)
  t, T              tare that patch, or all patches: the current reading becomes zero
  r                 start or stop a recording
- space             freeze the picture; the host continues
+ space             freeze the display; the host continues
  a                 show or hide shear arrows on the maps
  q, ctrl-c         quit
 
@@ -57,7 +57,7 @@ _SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
 
 
 class MonitorApp(App[None]):
-    """Full-screen monitor of a data source.
+    """Full-screen monitor for a data source.
 
     Args:
         source: Host or recording; the caller must close it.
@@ -142,7 +142,7 @@ class MonitorApp(App[None]):
         assert self._view is not None
         return self._view
 
-    # --- the picture
+    # --- drawing
 
     def _turn(self) -> None:
         """Get the newest view, draw it, and schedule the next update."""
@@ -177,7 +177,7 @@ class MonitorApp(App[None]):
             self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
-        """Draw the view, unless the terminal is still receiving the previous picture."""
+        """Draw the view, unless the terminal is still receiving the previous update."""
         driver = self._driver
         if isinstance(driver, PatientDriver):
             if driver.busy:
@@ -240,7 +240,7 @@ class MonitorApp(App[None]):
         self._draw()
 
     def action_pause(self) -> None:
-        """Freeze or unfreeze the picture."""
+        """Freeze or unfreeze the display."""
         self._paused = not self._paused
         self._draw()
 

@@ -124,7 +124,7 @@ def _weights(size: int, n: int) -> Float:
 
 
 def resample(grid: Float, width: int, height: int) -> Float:
-    """Interpolate a (U, N) grid to a (height, width) picture, in which upper wire 0 is the last row."""
+    """Interpolate a (U, N) grid to a (height, width) image in which upper wire 0 is the last row."""
     rows, columns = _weights(height, grid.shape[0]), _weights(width, grid.shape[1])
     return np.asarray((rows @ grid @ columns.T)[::-1])
 

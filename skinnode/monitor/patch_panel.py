@@ -23,11 +23,11 @@ _AROUND: Final = 3
 _LEAST_OUTLINED: Final = (8, 5)
 """Minimum size of a box in which the map has an outline: width in characters, height in lines."""
 _LABEL: Final = 10
-"""Width of the column of value names, in characters."""
+"""Width of the value-name column, in characters."""
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw all patches as tiles within ``height`` lines, in as many columns as give the largest maps."""
+    """Draw all patches as tiles in ``height`` lines, choosing the number of columns for the largest maps."""
     theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)

@@ -201,7 +201,7 @@ def _quiet(view: View) -> str:
     wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:
-        return f" no event yet; earlier faults: {', '.join(wrong)}"
+        return f" no events yet; earlier faults: {', '.join(wrong)}"
     lost = any(_losses(view, bus) for bus in view.buses)
     return " no event" if lost else " nothing happened"
 

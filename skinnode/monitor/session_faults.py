@@ -28,7 +28,7 @@ class FaultBook:
     """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
-        live: Whether the source is a running hand, whose patches must be operational soon after the start. A
+        live: Whether the source is a running hand, whose patches must be operational soon after start-up. A
             recording can begin before its patches are started, so they are checked only at the end.
     """
 

@@ -1,4 +1,4 @@
-"""Finds the contacts on a patch in its displacement field."""
+"""Finds the contacts on a patch from its displacement field."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    The contacts are taken from the field. A field of the exact inverse may contain none, for example in an
+    The contacts are taken from the field. A field from the exact inverse may contain none, for example in an
     old recording. Each connected region of pressed skin then counts as a contact, whose force is known only
     if a stiffness was specified.
 

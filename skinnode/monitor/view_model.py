@@ -48,7 +48,7 @@ class PatchView:
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
-    """Median time from the arrival of a scan's last CAN frame until its field was ready, s."""
+    """Median time in seconds from the arrival of a scan's last CAN frame until its field is ready."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool

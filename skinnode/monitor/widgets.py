@@ -17,13 +17,13 @@ from textual.widgets import Static
 from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
-"""Function that returns the lines of a picture, given its width and height."""
+"""Function that returns the lines to draw, given the width and height of the canvas."""
 
 
 class Canvas(Widget):
     """Canvas that draws a painter's lines and sends only changed lines to the terminal.
 
-    Textual's own widgets would redraw the whole picture on each update.
+    Textual's own widgets would redraw the whole canvas on each update.
     """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"

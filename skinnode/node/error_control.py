@@ -23,8 +23,8 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. A lost
-heartbeat of the other node does not end the conflict."""
+"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. The loss
+of one heartbeat from the other node does not end the conflict."""
 _RIVAL_NS: Final = 750_000_000
 """Duration of silence (ns) after which a node-ID conflict is considered resolved if this node sends no
 heartbeats. It equals three default heartbeat periods.
@@ -87,7 +87,7 @@ class ErrorControl:
         """Reset all error control services and forget all received heartbeats and guarding requests.
 
         Args:
-            node_id: node-ID of this node.
+            node_id: Node-ID of this node.
         """
         self._cob_id = od.heartbeat_cob_id(node_id)
         self._rival_until_ns = NO_DEADLINE_NS

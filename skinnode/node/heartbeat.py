@@ -15,8 +15,8 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pacing import NO_DEADLINE_NS
 
 _BOOTED: Final = 1
-"""Second manufacturer-specific byte of the emergency message for a monitored node that has restarted; 0 means
-that its heartbeat is overdue."""
+"""Second manufacturer-specific byte of the emergency message for a monitored node that has restarted; the
+byte is 0 if a heartbeat is overdue."""
 
 
 class HeartbeatProducer:
@@ -114,7 +114,7 @@ class HeartbeatConsumer:
         booted. While a node is monitored, a boot-up message means that it has restarted.
 
         Args:
-            node_id: node-ID of the monitored node.
+            node_id: Node-ID of the monitored node.
             state: NMT state in the message.
             t_ns: Arrival time, ns.
         """

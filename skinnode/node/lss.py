@@ -28,7 +28,7 @@ _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
 """Error codes in responses. The meaning of code 1 depends on the request."""
 
 
-# Part of the LSS address, and comparison, for each request of *switch state selective* and *identify*.
+# LSS address part and comparison for each request of *switch state selective* and *identify*.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -79,7 +79,7 @@ class LssSlave:
         """Node-ID that becomes active at the next *reset communication*."""
         self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
-        """Bit rate for the next *activate bit timing*, bit/s; None to keep the current bit rate."""
+        """Bit rate in bit/s for the next *activate bit timing*; None to keep the current bit rate."""
         self._next_question = 0
         self._scan_part = 0
 
@@ -113,10 +113,10 @@ class LssSlave:
         """Handle a request from the LSS master.
 
         CiA 305 requires a slave to ignore frames that are not 8 bytes long, unknown commands, and requests
-        that are not allowed in its current state, which may be intended for other slaves.
+        that are not allowed in its current state, because these may be intended for other slaves.
 
-        After *activate bit timing*, the node is silent for twice the delay in the request. It changes its bit
-        rate halfway. The second half gives the other nodes time to change their bit rates.
+        After *activate bit timing*, the node is silent for twice the delay in the request and changes its bit
+        rate halfway through. The second half gives the other nodes time to change their bit rates.
 
         Args:
             data: Payload of the frame.

@@ -33,17 +33,17 @@ class Kept:
     node_id: int | None = None
     """Node-ID stored by LSS, 1 to 127, or 255 for no node-ID; None if LSS has stored nothing."""
     bit_rate_bps: int | None = None
-    """Bit rate stored by LSS, bit/s; None if LSS has not stored a bit rate."""
+    """Bit rate stored by LSS in bit/s; None if LSS has not stored a bit rate."""
     communication: Parameters = Parameters()
     """Saved communication parameters (0x1000 to 0x1FFF)."""
     application: Parameters = Parameters()
     """Saved application parameters (0x2000 to 0x9FFF)."""
     baseline_ohm: tuple[tuple[float, ...], ...] = ()
-    """(U, K) baseline R0 with REAL32 precision, ohm; empty if none has been saved."""
+    """(U, K) baseline R0 in ohms with REAL32 precision; empty if none has been saved."""
 
 
 class Fault(IntEnum):
-    """Fault of a memory. The value is the first manufacturer-specific byte of the emergency message."""
+    """Memory fault. The value is the first manufacturer-specific byte of the emergency message."""
 
     UNREADABLE = 1
     DAMAGED = 2

@@ -1,4 +1,4 @@
-"""Non-volatile memory of a node in a JSON file with a checksum, which is replaced atomically."""
+"""Stores a node's non-volatile memory in a JSON file that has a checksum and is replaced atomically."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _MOST_BYTES: Final = 1 << 24
 class FileMemory:
     """Non-volatile memory of a node in a JSON file.
 
-    **Locking.** :meth:`claim` or the first :meth:`save` locks the file for exclusive access, until
+    **Locking.** :meth:`claim` or the first :meth:`save` locks the file for exclusive access until
     :meth:`close` is called, a ``with`` block ends or the object is deleted. The lock is a kernel lock on a
     separate file in the same folder, which the kernel releases even if the process is killed.
 
-    **Saving** writes a temporary file, flushes it to the disk and renames it to the memory file. If the power
+    **Saving** writes a temporary file, flushes it to disk and renames it to the memory file. If the power
     fails or the process is killed, the memory file has either its old or its new contents. Saving takes a few
     milliseconds, during which all nodes on the same thread are blocked.
 

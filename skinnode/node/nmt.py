@@ -34,7 +34,7 @@ class NmtSlave:
 
         Args:
             data: Payload of the frame.
-            node_id: node-ID of this node.
+            node_id: Node-ID of this node.
         """
         try:
             return parse(data, node_id)
@@ -55,8 +55,8 @@ class NmtSlave:
     def on_communication_error(self, t_ns: int) -> None:
         """Apply the error behaviour (0x1029) after a heartbeat event, a life guarding event or bus-off.
 
-        Depending on 0x1029:1, the node leaves OPERATIONAL for PRE-OPERATIONAL (0), keeps its state (1) or
-        enters STOPPED (2).
+        Depending on 0x1029:1, the node changes from OPERATIONAL to PRE-OPERATIONAL (0), keeps its state (1)
+        or enters STOPPED (2).
         """
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:

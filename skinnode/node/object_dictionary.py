@@ -92,7 +92,7 @@ class ObjectStore:
 
     Args:
         objects: Declarations of all objects.
-        node_id: node-ID added to the default COB-IDs.
+        node_id: Node-ID added to the default COB-IDs.
     """
 
     def __init__(self, objects: Iterable[Object], node_id: int) -> None:

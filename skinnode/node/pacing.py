@@ -8,7 +8,7 @@ NO_DEADLINE_NS: Final = 1 << 63
 """Deadline in ns if nothing is scheduled. It is never reached."""
 
 Clock = Callable[[], int]
-"""Callback that returns the time of the event being handled in ns."""
+"""Callback that returns the time (ns) of the event being handled."""
 
 
 @dataclass(frozen=True, slots=True)

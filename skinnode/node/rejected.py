@@ -21,7 +21,7 @@ class Rejected(IntEnum):
     TIME = 3
     """TIME message that is not six bytes long or contains an invalid time of day."""
     HEARTBEAT = 4
-    """Heartbeat from a monitored node that is not one byte long."""
+    """Heartbeat that comes from a monitored node and is not one byte long."""
     SDO = 5
     """SDO request that is not eight bytes long."""
     RPDO = 6

@@ -30,7 +30,7 @@ class TimeConsumer:
 
     Args:
         store: Object dictionary.
-        now: Function that returns the time of the event being handled in ns.
+        now: Function that returns the time (ns) of the event being handled.
     """
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:

@@ -3,7 +3,7 @@
 A terminal sends SIGINT (Ctrl-C) and SIGHUP to a command and to all of its child processes. SIGINT would make
 a child print a traceback if it is still importing modules, and SIGHUP would kill the ``multiprocessing``
 resource tracker before it has cleaned up. Child processes therefore run with both signals blocked, and the
-command ends them itself.
+command terminates them itself.
 """
 
 from __future__ import annotations

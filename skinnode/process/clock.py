@@ -1,4 +1,4 @@
-"""Time, waiting and threads, on the system clock or on a virtual clock.
+"""Provides time, waiting and threads on the system clock or on a virtual clock.
 
 All code that reads the time, waits or starts threads must use this module, so that it can run in virtual
 time. :func:`use` sets the clock of the current thread, and a new thread inherits the clock of the thread that

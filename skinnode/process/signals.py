@@ -32,7 +32,7 @@ class SignalEvent(threading.Event):
         self._wake.put(None)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for up to ``timeout`` seconds until the event is set; return whether it is set."""
+        """Wait up to ``timeout`` seconds for the event to be set; return whether it is set."""
         if not self._is_set:
             with suppress(Empty):
                 self._wake.get(timeout=None if timeout is None else max(0.0, timeout))

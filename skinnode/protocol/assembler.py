@@ -71,9 +71,9 @@ class ScanAssembler:
         counter_overflow: Synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
             the patch counts its own scans from 0 to 255.
         period_ns: Scan period, ns. The timeout is a multiple of this period.
-        grace_ns: Maximum time (ns) to wait for the remaining frames after the summary, or after all chunks of
-            a full scan, has arrived.
-        node_id: node-ID for the COB-IDs in the errors passed to ``on_reject``.
+        grace_ns: Maximum time (ns) to wait for the remaining frames once the summary or all chunks of a full
+            scan have arrived.
+        node_id: Node-ID for the COB-IDs in the errors passed to ``on_reject``.
         on_reject: Callback that receives a CodecError for each frame with a wrong length, and for each
             summary that lacks a required check.
         under_way: Whether the node may already be sending scans; see :meth:`reset`.

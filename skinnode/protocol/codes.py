@@ -98,7 +98,7 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
     """Round R0 to REAL32, its precision in the object dictionary.
 
     Args:
-        baseline_ohm: R0, ohm; any shape.
+        baseline_ohm: R0 in ohms; any shape.
 
     Returns:
         Rounded R0 in ohms, float64 of the same shape.
@@ -114,8 +114,8 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     and finite.
 
     Args:
-        resistance_ohm: Resistances, ohm; any shape.
-        baseline_ohm: R0, ohm; broadcastable to the shape of the resistances.
+        resistance_ohm: Resistances in ohms; any shape.
+        baseline_ohm: R0 in ohms; broadcastable to the shape of the resistances.
         scale: Mapping of R/R0 to codes.
 
     Returns:
@@ -140,7 +140,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
 
 
 def _all_measured(code: Float, distance: Float, scale: CodeScale) -> bool:
-    """Return whether all codes are certainly measurements and none is near a tie, which is the usual case.
+    """Return whether all codes are definitely measurements and none is near a tie (the usual case).
 
     If the code range begins at least one step above 0, a ratio R/R0 inside the range implies that R and R0
     are positive and finite.
@@ -167,8 +167,8 @@ def _round_exactly(
     Args:
         code: Rounded positions in the code range; any shape.
         near_tie: Mask of the positions that cannot be rounded reliably in double precision.
-        resistance: Resistances, ohm; broadcastable to the shape of ``code``.
-        baseline: R0, ohm; broadcastable to the shape of ``code``.
+        resistance: Resistances in ohms; broadcastable to the shape of ``code``.
+        baseline: R0 in ohms; broadcastable to the shape of ``code``.
         scale: Mapping of R/R0 to codes.
     """
     exact = np.array(code)
@@ -185,7 +185,7 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
 
     Args:
         codes: Codes of any shape, which may include :data:`MISSING`.
-        baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
+        baseline_ohm: R0 in ohms; broadcastable to the shape of the codes.
         scale: Mapping of R/R0 to codes.
 
     Returns:
@@ -200,7 +200,7 @@ class Decoder:
     """Decodes many scans with the same baseline; equivalent to :func:`decode`.
 
     Args:
-        baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
+        baseline_ohm: R0 in ohms; broadcastable to the shape of the codes.
         scale: Mapping of R/R0 to codes.
     """
 

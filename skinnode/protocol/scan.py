@@ -72,7 +72,7 @@ class AssemblerStats:
     scans_mixed: int
     """Scans discarded because they seem to contain frames of two scans with the same counter."""
     scans_corrupt: int
-    """Scans discarded because the check failed: at least one code differs from what the node packed."""
+    """Scans discarded because the check failed: at least one code differs from the node's code."""
     scans_joined: int
     """Incomplete scans discarded because reception began after the node had started sending them."""
     chunks_accepted: int

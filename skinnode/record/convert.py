@@ -2,7 +2,7 @@
 
 The file suffixes determine the formats. A conversion between two frame files copies every frame and the
 journal, so a replay of the result computes the same fields. An MCAP target also receives the fields, contacts
-and poses, which a replay computes. A field table contains the results of a replay and the resistances.
+and poses computed by a replay. A field table contains the results of a replay and the resistances.
 """
 
 from __future__ import annotations
@@ -133,9 +133,9 @@ def _copy_mcap(source: Path, target: Path) -> Conversion:
 
 def _copy_table(source: Path, target: Path) -> Conversion:
     hand, rows = read_parquet(source) if source.suffix == PARQUET else read_npz(source)
-    lost = f"{target.name} cannot contain contacts and faults" if target.suffix == NPZ else None
+    lost = f"{target.name} cannot contain contacts or faults" if target.suffix == NPZ else None
     if source.suffix == NPZ and target.suffix == PARQUET:
-        lost = f"{source.name} contains no contacts and faults"
+        lost = f"{source.name} contains no contacts or faults"
     fields = _write_table(target, hand, rows)
     return Conversion(0, fields, (), () if lost is None or source.suffix == target.suffix else (lost,))
 
@@ -201,7 +201,7 @@ def write_computed_field(file: McapFile, field: FieldFrame, rest_m: Float, offse
 
     Args:
         file: The file.
-        field: The field, with a stamp.
+        field: The field; must have a stamp.
         rest_m: (U, N, 3) electrode positions at rest, m.
         offset_ns: Time since 1970 minus time on the stamp's clock, ns.
     """
@@ -259,7 +259,7 @@ def _losses(recording: OpenRecording, target: Path, tee: CopiedFrames) -> list[s
         lost += ["times finer than 1 µs"]
     if target.suffix == ".asc":
         lost += ["the time zone"]
-        lost += ["identifier and data of error frames"] if tee.errors else []
+        lost += ["the identifiers and data of error frames"] if tee.errors else []
     return [f"{target.name} cannot contain {'; '.join(lost)}"] if lost else []
 
 

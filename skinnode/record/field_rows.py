@@ -74,7 +74,7 @@ def row_of(field: FieldFrame, resistance: ResistanceFrame, offset_ns: int) -> Fi
     """Convert a field to a table row.
 
     Args:
-        field: The field, with a stamp.
+        field: The field; must have a stamp.
         resistance: Resistances from which the field was computed.
         offset_ns: Time since 1970 minus time on the stamp's clock, ns.
     """

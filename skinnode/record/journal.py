@@ -14,10 +14,11 @@ the event, and ``t_ns`` is its time on the host's monotonic clock.
 ``withheld``   scans of ``patch`` are no longer decoded
 ``polled``     a timeout ended an incomplete scan
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
-``dropped``    ``frames`` were not written because the disk was too slow
+``dropped``    ``frames`` frames were not written because the disk was too slow
 ``repaired``   the file is a copy of the readable part of a recording, with ``frames`` frames; ``damaged``
                counts the unreadable parts before the end
-``ended``      the recording was closed with ``frames`` in the log; if this event is missing, the process was
+``ended``      the recording was closed with ``frames`` frames in the log; if this event is missing, the
+process was
                killed or the disk was full
 =============  ==============================================================================
 """

@@ -114,7 +114,7 @@ class McapFile:
         """Write a field and its contacts.
 
         Args:
-            field: The field, with a stamp.
+            field: The field; must have a stamp.
             rest_m: (U, N, 3) electrode positions at rest, m.
             offset_ns: Time since 1970 minus time on the stamp's clock, ns.
             log_ns: Time since 1970 at which the recorder received the field, ns.

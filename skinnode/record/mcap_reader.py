@@ -49,7 +49,7 @@ class McapReader:
 
     @property
     def damages(self) -> list[Damage]:
-        """First damaged parts of the file."""
+        """Damaged parts found so far; only the first few are kept."""
         return self._chunks.damages
 
     @property

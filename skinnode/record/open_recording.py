@@ -33,7 +33,7 @@ class Frames(Protocol):
 
     @property
     def damages(self) -> list[Damage]:
-        """First damaged parts of the file."""
+        """Damaged parts found so far; only the first few are kept."""
 
     @property
     def damaged(self) -> int:
@@ -81,7 +81,7 @@ class OpenRecording:
     """Name of the file that contains the journal."""
     channels: ChannelMap
     foreign: bool = False
-    """Whether there is no journal, so the header and the events were created from a hand file."""
+    """Whether the header and the events were created from a hand file because there is no journal."""
     notes: tuple[str, ...] = ()
     """Assumptions made because there is no journal."""
 
@@ -180,7 +180,7 @@ def _require_no_journal(path: Path) -> None:
     else:
         found, where = journal_of(path).exists(), journal_of(path).name
     if found:
-        raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} has the hand")
+        raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} contains the hand")
 
 
 def _channels_in(path: Path, hand: HandConfig) -> dict[str, str]:

@@ -163,7 +163,7 @@ def test_npz_and_parquet_hold_the_same(recorded: Path, tmp_path: Path) -> None:
     convert(recorded, tmp_path / "x.npz")
     convert(tmp_path / "x.parquet", tmp_path / "y.npz")
     there = convert(tmp_path / "x.npz", tmp_path / "z.parquet")
-    assert there.notes == ("x.npz contains no contacts and faults",)
+    assert there.notes == ("x.npz contains no contacts or faults",)
     with np.load(tmp_path / "x.npz") as x, np.load(tmp_path / "y.npz") as y:
         assert x.files == y.files
         for name in x.files:

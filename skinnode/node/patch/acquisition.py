@@ -16,8 +16,8 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
-"""Number of readings averaged for a baseline. The baseline's noise is then a quarter of a single reading's,
-and the relative noise of R/R0 is only 3 % higher than that of R."""
+"""Number of readings averaged for a baseline. The noise of the baseline is then a quarter of the noise of a
+single reading, and the relative noise of R/R0 is only 3 % higher than that of R."""
 
 
 class Acquisition:
@@ -27,7 +27,7 @@ class Acquisition:
         profile: Sizes of the patch.
         source: Analogue port of the patch.
         scale: Mapping of R/R0 to codes.
-        baseline_ohm: (U, K) initial R0, ohm; None if the patch has no baseline yet.
+        baseline_ohm: (U, K) initial R0 in ohms; None if the patch has no baseline yet.
 
     Raises:
         ValueError: If the baseline has the wrong shape or a negative value.

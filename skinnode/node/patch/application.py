@@ -97,7 +97,7 @@ class PatchApplication:
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) baseline R0, ohm; 0 where unknown."""
+        """(U, K) baseline R0 in ohms; 0 where unknown."""
         return self._acquisition.baseline_ohm.astype(np.float64)
 
     def power_on(self, t_ns: int) -> None:

@@ -120,7 +120,7 @@ def _bind_baseline_row(
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
-    """Return a sub-index's bit mask of 32 wires: open wires if it is odd, shorted wires if even."""
+    """Return the 32-wire bit mask at a sub-index: open wires if it is odd, shorted wires if it is even."""
     first = (subindex - 1) // 2 * 32
     bits = masks[(subindex - 1) % 2][first : first + 32]
     return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")

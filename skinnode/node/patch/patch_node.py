@@ -30,7 +30,7 @@ class PatchNode(CanopenDevice):
         send: Function that sends a frame, given its COB-ID and payload.
         profile: Wire format of the patch; by default, 16-bit codes on classic CAN.
         serial: Serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
+        baseline_ohm: (U, K) initial R0 in ohms; None to tare at the first power-on. A baseline in the memory
             takes precedence.
         pacing: :data:`~skinnode.node.pacing.EXACT` for a node on its own board,
             :data:`~skinnode.node.pacing.THRIFTY` for many nodes on one computer.
@@ -83,7 +83,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) baseline R0, ohm; 0 where unknown."""
+        """(U, K) baseline R0 in ohms; 0 where unknown."""
         return self._patch.baseline_ohm
 
     @property

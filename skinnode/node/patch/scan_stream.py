@@ -7,13 +7,14 @@ Otherwise, it is sent at the next SYNC at which it is due. The end of a scan als
 TPDOs that contain other objects.
 
 **Pacing.** CiA 301 defines the inhibit time as a minimum interval between frames. Under a general-purpose
-operating system, threads wake up late, and with a strict minimum interval, a scan could take longer than the
-SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary by sending
+operating system, threads can wake up late, so with a strict minimum interval, a scan could take longer than
+the SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary by sending
 several frames at once. The mean frame rate stays within the limit set by the inhibit time (generic cell rate
 algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
 
 The node has no clock to measure how long it takes to read the resistances after a SYNC. The stream therefore
-requests a timer event directly after the first chunk, and paces the second chunk from the time of that event.
+requests a timer event immediately after the first chunk and paces the second chunk from the time of that
+event.
 
 **Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs are discarded if they are still
 unsent when the window closes. Event-driven TPDOs are not affected.

@@ -25,8 +25,8 @@ The relative standard error of the noise estimate is 1/√30 = 18 % for one cros
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Maximum relative noise of a reading that passes the self-test. The accuracy of the solver is specified
-for a hundredth of this noise."""
+"""Maximum relative noise of a reading that passes the self-test. The accuracy of the solver is specified for
+one hundredth of this noise."""
 
 
 @np.errstate(over="ignore", invalid="ignore")  # only absurdly large resistances overflow
@@ -35,7 +35,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
     Args:
         read: Function that returns (U, K) resistances in ohms or raises SourceFailed.
-        baseline_ohm: (U, K) R0, ohm.
+        baseline_ohm: (U, K) R0 in ohms.
         scale: Mapping of R/R0 to codes.
 
     Returns:
@@ -75,7 +75,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the RMS over all crossings of the relative standard deviation."""
+    """Return the RMS, over all crossings, of the relative standard deviation."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

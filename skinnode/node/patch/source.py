@@ -1,4 +1,4 @@
-"""Analogue port of a patch: interface of a resistance source, such as a converter or the simulator."""
+"""Analogue port of a patch: interface to a resistance source, such as a converter or the simulator."""
 
 from __future__ import annotations
 

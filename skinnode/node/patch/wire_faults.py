@@ -32,7 +32,7 @@ class WireFaults:
 
     @staticmethod
     def none(profile: PatchProfile) -> WireFaults:
-        """Return the value for a patch without wire faults."""
+        """Return a WireFaults object without faults."""
         return _no_faults((profile.rows, profile.columns))
 
     @property
@@ -48,8 +48,7 @@ class WireFaults:
 
 @functools.cache
 def _no_faults(shape: tuple[int, int]) -> WireFaults:
-    """Return the value for a patch that has U upper and K lower wires and no wire faults. Its arrays are
-    read-only."""
+    """Return a WireFaults object without faults for U upper and K lower wires. Its arrays are read-only."""
     upper, lower = (np.zeros(wires, dtype=np.bool_) for wires in shape)
     for mask in (upper, lower):
         mask.flags.writeable = False
@@ -82,14 +81,15 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Forget the reported faults after a reset, so that persisting faults are reported again."""
+        """Forget the reported faults after a reset, so that persistent faults are reported again."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
         """Report new wire faults, or the end of all wire faults.
 
-        Faults that begin in the same scan, such as when a connector is unplugged, are reported in one
-        message. It contains the type and wire number of the first new fault, and the number of faulty wires.
+        Faults that begin in the same scan, for example when a connector is unplugged, are reported in one
+        message, which contains the type and wire number of the first new fault, and the number of faulty
+        wires.
 
         Args:
             faults: Current wire faults.

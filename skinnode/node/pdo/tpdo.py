@@ -5,7 +5,7 @@ type       sent
 =========  =======================================================================================
 0          after a SYNC, if the values have changed since the last transmission
 1 to 240   after every n-th SYNC, counted from the SYNC start value if one is set
-252        on a remote frame, with the values of the last SYNC; not before the first SYNC
+252        on a remote frame, with the values from the last SYNC; not before the first SYNC
 253        on a remote frame
 254, 255   on an event (:meth:`TpdoEngine.trigger`), when the event timer elapses, and on a remote frame;
            never before the inhibit time has passed

@@ -20,7 +20,7 @@ event.
 unsent when the window closes. Event-driven TPDOs are not affected.
 
 **Queue.** While a scan is being sent, one other scan can wait. Chunks of two scans are never interleaved. If
-the node leaves OPERATIONAL, all queued scans are dropped without a summary. If the chunk TPDO is disabled,
+the node leaves OPERATIONAL, all scans are dropped without a summary. If the chunk TPDO is disabled,
 the summary states that chunks are missing.
 """
 

@@ -26,7 +26,7 @@ from skinnode.monitor.view_model import History, Level, LogLine, View, log_line,
 from skinnode.monitor.widgets import Canvas, Dialog
 
 PERIOD_S: Final = 0.1
-"""Minimum interval between screen updates, s."""
+"""Minimum interval between screen updates, in seconds."""
 SHARE: Final = 0.2
 """Maximum fraction of one processor core's time spent on drawing.
 

@@ -55,9 +55,9 @@ _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum depth at full brightness, m. With a smaller minimum, noise would look like a touch."""
+"""Minimum depth (m) at full brightness. With a smaller minimum, noise would look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which a press continues to affect the brightness scale after it has ended, ns."""
+"""Time (ns) for which a press continues to affect the brightness scale after it has ended."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ class Surface:
 
     @property
     def deepest_m(self) -> float:
-        """Maximum known depth, m."""
+        """Maximum known depth, in metres."""
         return float(np.max(self.depth_m, initial=0.0, where=~self.unknown))
 
 
@@ -170,12 +170,12 @@ class MapStyle:
     """Parameters that determine how maps are drawn."""
 
     full_m: float
-    """Depth drawn at full brightness, m."""
+    """Depth drawn at full brightness, in metres."""
     colours: Colours
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m; a quarter of that depth, because shear is smaller."""
+        """Shear (m) drawn at full brightness; a quarter of that depth, because shear is smaller."""
         return 0.25 * self.full_m
 
 

@@ -143,7 +143,7 @@ def _health(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def shear_text(shear_m: tuple[float, float]) -> str:
-    """Format a shear in m as an arrow and a magnitude; return an empty string below 1 µm."""
+    """Format a shear in metres as an arrow and a magnitude; return an empty string below 1 µm."""
     size_um = 1e6 * float((shear_m[0] ** 2 + shear_m[1] ** 2) ** 0.5)
     return "" if size_um < 1.0 else f"{field_map.arrow(*shear_m)} {size_um:.0f} µm"
 

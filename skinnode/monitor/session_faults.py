@@ -15,13 +15,13 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time within which all patches of a running hand must become operational, ns."""
+"""Time (ns) within which all patches of a running hand must become operational."""
 
 LOOK_S: Final = 0.1
-"""Interval between checks of the source for faults, s."""
+"""Interval between checks of the source for faults, in seconds."""
 
 LINE_S: Final = 1.0
-"""Interval between JSON lines, s."""
+"""Interval between JSON lines, in seconds."""
 
 
 class FaultBook:

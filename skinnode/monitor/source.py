@@ -78,7 +78,7 @@ class Source(Protocol):
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Wall-clock time minus the time on the monotonic clock used in snapshots, ns."""
+        """Wall-clock time minus the time on the monotonic clock used in snapshots, in ns."""
 
     @property
     def over(self) -> bool:
@@ -146,7 +146,7 @@ class HostSource(Closing):
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Wall-clock time minus monotonic time, ns."""
+        """Wall-clock time minus monotonic time, in ns."""
         return clock.time_ns() - clock.monotonic_ns()
 
     @property
@@ -240,7 +240,7 @@ class ReplaySource(Closing):
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Wall-clock time minus monotonic time on the recording host, ns."""
+        """Wall-clock time minus monotonic time on the recording host, in ns."""
         return self._run.wall_minus_mono_ns
 
     @property

@@ -19,7 +19,7 @@ _MAX_QUEUED: Final = 30
 """Maximum number of writes queued for the terminal, enough for a few screen updates."""
 
 _END_S: Final = 1.0
-"""Maximum wait at exit for the terminal to accept queued output, s."""
+"""Maximum time (s) to wait at exit for the terminal to accept queued output."""
 
 
 class _Writer(threading.Thread):

@@ -104,7 +104,7 @@ class Paint:
     theme: Theme
     ui: UiState
     full_m: float
-    """Depth drawn at full brightness, m."""
+    """Depth drawn at full brightness, in metres."""
 
     @property
     def map_style(self) -> MapStyle:

@@ -29,7 +29,7 @@ from skinnode.monitor.touches import Touch, touches_of
 Level = Literal["good", "note", "bad"]
 """Severity of a condition: ``good`` for no fault, ``note`` for a condition to check, ``bad`` for a fault."""
 HISTORY_NS: Final = 2_000_000_000
-"""Period over which rates and latencies are computed, ns."""
+"""Period over which rates and latencies are computed, in ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,9 +63,9 @@ class PatchView:
     surface: Surface | None
     depth_m: float | None
     depth_std_m: float | None
-    """Standard deviation of the deepest electrode's depth, m."""
+    """Standard deviation of the deepest electrode's depth, in metres."""
     shear_m: tuple[float, float]
-    """Mean shear (x, y), weighted by depth, m."""
+    """Depth-weighted mean shear (x, y) in metres."""
     touches: tuple[Touch, ...]
 
 
@@ -101,7 +101,7 @@ class View:
 
     @property
     def deepest_m(self) -> float:
-        """Depth of the deepest press on any patch, m."""
+        """Depth of the deepest press on any patch, in metres."""
         return max((patch.depth_m or 0.0 for patch in self.patches), default=0.0)
 
     def patch(self, name: str) -> PatchView:

@@ -155,7 +155,7 @@ class EmcyProducer:
 
     @property
     def _free_ns(self) -> int:
-        """End of the inhibit time of the last message, ns."""
+        """Time (ns) at which the inhibit time of the last message ends."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary

@@ -24,7 +24,7 @@ class HeartbeatProducer:
 
     def __init__(self) -> None:
         self.period_ns = 0
-        """Heartbeat period, ns; 0 if the node sends no heartbeats."""
+        """Heartbeat period in ns; 0 if the node sends no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
         """Time (ns) at which the next heartbeat must be sent."""
 

@@ -40,9 +40,9 @@ class Lengths(NamedTuple):
     """Permitted lengths of the values that a client writes to an object."""
 
     least: int
-    """Minimum length, bytes."""
+    """Minimum length in bytes."""
     most: int
-    """Maximum length, bytes."""
+    """Maximum length in bytes."""
 
     def check(self, length: int) -> None:
         """Check the length of a complete value.

@@ -14,7 +14,7 @@ from skinnode.process import clock
 from skinnode.record.recorder import Recorder
 
 HEALTH_S: Final = 1.0
-"""Interval at which the health of all patches and buses is recorded, s."""
+"""Interval (s) at which the health of all patches and buses is recorded."""
 
 CAPACITY_FIELDS: Final = 4096
 """Maximum number of fields queued for the recorder; about ten seconds of fields from sixteen patches."""

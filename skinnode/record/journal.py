@@ -80,7 +80,7 @@ class Header:
     started: str
     """Local date and time at which the recording began, in ISO 8601 format."""
     wall_minus_mono_ns: int
-    """Log timestamp minus time on the host's monotonic clock, ns."""
+    """Log timestamp minus time on the host's monotonic clock, in ns."""
 
     def line(self) -> str:
         """Return the header as a line of JSON."""

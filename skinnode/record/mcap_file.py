@@ -140,7 +140,7 @@ class McapFile:
         self._write(TF_STATIC, TRANSFORMS, transforms(self._skeleton, log_ns), log_ns, log_ns)
 
     def write_event(self, event: HealthEvent, offset_ns: int, log_ns: int) -> None:
-        """Write an event; ``offset_ns`` is the time since 1970 minus the time on the event's clock, ns."""
+        """Write an event; ``offset_ns`` is the time since 1970 minus the time on the event's clock."""
         t_ns = event.t_ns + offset_ns
         self._write(self._topics.events, LOG, log_message(event, t_ns), t_ns, log_ns)
 

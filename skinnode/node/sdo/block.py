@@ -20,7 +20,7 @@ from skinnode.errors import BusError
 from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 SEGMENT_NS: Final = 500_000
-"""Initial mean interval between segments, ns.
+"""Initial mean interval between segments, in ns.
 
 The resulting rate of 2000 frames/s is below the 2200 frames/s available on a 1 Mbit/s bus with 70 % PDO load,
 so the transmit queue does not fill up. A block of 127 segments takes 64 ms, which is well within client
@@ -28,8 +28,8 @@ time-outs (the canopen library waits 300 ms). Whenever the bus refuses a segment
 rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean interval between segments, ns. At this interval, segments use a quarter of the capacity of a
-125 kbit/s bus."""
+"""Maximum mean interval between segments, in ns. At this interval, segments use a quarter of the capacity of
+a 125 kbit/s bus."""
 SEGMENTS_AT_ONCE: Final = 4
 """Maximum number of segments sent at once after the thread has woken up late.
 

@@ -1,4 +1,4 @@
-"""Keep the old import paths of moved names working for one version, with a deprecation warning."""
+"""Keeps the old import paths of moved names working for one version, with a deprecation warning."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Reads layout files that contain electrode positions.
 
-Layout files in TOML format that contain the parameters of a preset are read by :mod:`skinnode.config`.
+TOML layout files that contain preset parameters are read by :mod:`skinnode.config`.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ _ARRAYS = ("upper_m", "lower_m")
 _KEYS = (*_ARRAYS, "resistivity_ohm_per_m")
 _MOST_NPZ_BYTES: Final = 16 << 20
 _MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
-"""Maximum number of elements of each array in a layout file."""
+"""Maximum number of elements in each array of a layout file."""
 _MOST_ITEM_BYTES: Final = 32
-"""Size of NumPy's largest numeric type, bytes."""
+"""Size of NumPy's largest numeric type in bytes."""
 _LONGEST_KEY: Final = 40
 _MOST_HEADER_BYTES: Final = 10_240
-"""Maximum size of an array header, bytes; NumPy accepts headers of up to 10,000 characters."""
+"""Maximum size of an array header in bytes; NumPy accepts headers of up to 10,000 characters."""
 
 
 def read_npz(path: Path) -> PatchLayout:
-    """Read a layout from an NPZ file. Pickled objects are refused.
+    """Read a layout from an NPZ file. Pickled objects are rejected.
 
     Args:
-        path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3), in metres, and optionally
-            the number ``resistivity_ohm_per_m``.
+        path: File containing the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3), in metres, and
+            optionally the number ``resistivity_ohm_per_m``.
 
     Raises:
         ConfigError: If the file is not an NPZ file or does not contain a valid layout.
@@ -73,9 +73,9 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # with other methods, zipfile decompresses a whole member at once
+            ):  # with other methods, zipfile decompresses an entire member at once
                 got = Shown(f"compression method {member.compress_type}")
-                raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
+                raise ConfigError(key, got, "stored or deflated, as written by NumPy", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
             behind_header = member.file_size - _MOST_HEADER_BYTES
             _require_size(key, f"{member.file_size} bytes", behind_header, most_bytes, path)
@@ -106,7 +106,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
     """
     for key in _ARRAYS:
         if key not in table:
-            raise ConfigError(key, NOTHING, "an array of electrodes, metres", where=str(path))
+            raise ConfigError(key, NOTHING, "an array of electrode positions in metres", where=str(path))
     for key in table:
         if key not in _KEYS:
             raise ConfigError(key, Shown("an unknown key"), f"one of {', '.join(_KEYS)}", where=str(path))
@@ -120,7 +120,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
 
 
 def impossible(error: ValueError, table: str = "", where: str = "") -> ConfigError:
-    """Convert an error of :class:`PatchLayout` to a ConfigError about a key of ``table``."""
+    """Convert an error raised by :class:`PatchLayout` to a ConfigError about a key in ``table``."""
     key, _, what = str(error).partition(": ")
     got, _, allowed = what.partition(", must be ")
     key = f"{table}.{key}" if table else key

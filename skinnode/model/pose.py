@@ -13,7 +13,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Maximum deviation of a quaternion's length from 1; accounts for rounded input."""
+"""Maximum deviation of a quaternion's length from 1, chosen to accept rounded input."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Pose:
     In the frame of a patch, x points along the upper wires, y across them, and z out of the skin.
 
     Args:
-        position_m: Origin of the frame in the parent frame, metres.
+        position_m: Origin of the frame in the parent frame, in metres.
         quaternion_xyzw: Orientation of the frame as a unit quaternion, real part last.
 
     Raises:
@@ -45,9 +45,9 @@ class Pose:
         """Return a pose from roll, pitch and yaw, as in URDF.
 
         Args:
-            position_m: Origin of the frame in the parent frame, metres.
-            rpy_rad: Rotations about the fixed axes x (roll), y (pitch) and z (yaw) of the parent frame, in
-                this order, radians.
+            position_m: Origin of the frame in the parent frame, in metres.
+            rpy_rad: Rotations in radians about the fixed axes x (roll), y (pitch) and z (yaw) of the parent
+                frame, applied in that order.
         """
         (sr, sp, sy), (cr, cp, cy) = (
             tuple(function(angle / 2) for angle in rpy_rad) for function in (math.sin, math.cos)
@@ -75,12 +75,12 @@ class Pose:
         )
 
     def vectors(self, inner: ArrayLike) -> Float:
-        """Convert vectors (..., 3), such as displacements or forces, from this frame to the parent frame."""
+        """Convert (..., 3) vectors, such as displacements or forces, from this frame to the parent frame."""
         turned: Float = np.asarray(inner, np.float64) @ self.rotation.T
         return turned
 
     def points_m(self, inner_m: ArrayLike) -> Float:
-        """Convert points (..., 3), metres, from this frame to the parent frame."""
+        """Convert (..., 3) points, in metres, from this frame to the parent frame."""
         points: Float = self.vectors(inner_m) + np.array(self.position_m)
         return points
 
@@ -107,14 +107,14 @@ class Pose:
         return Pose((x_m, y_m, z_m), back.quaternion_xyzw)
 
     def _unit(self) -> tuple[float, float, float, float]:
-        """Return the quaternion scaled to unit length; otherwise rounding errors would accumulate."""
+        """Return the quaternion scaled to unit length, so that rounding errors do not accumulate."""
         length = math.hypot(*self.quaternion_xyzw)
         x, y, z, w = self.quaternion_xyzw
         return x / length, y / length, z / length, w / length
 
 
 def positions_in_hand_m(field: FieldFrame, layout: PatchLayout, pose: Pose) -> Float:
-    """Return the positions (U, N, 3) of the upper electrodes in the hand's frame, metres.
+    """Return the (U, N, 3) positions of the upper electrodes in the hand's frame, in metres.
 
     ``pose`` is the pose of the patch's frame in the hand's frame.
     """

@@ -20,13 +20,13 @@ class Status(enum.IntEnum):
     STEP_TOO_SMALL = 4
     """The steps became smaller than the tolerance, but the iterate is not a root."""
     ILL_CONDITIONED = 5
-    """The Jacobian is singular, too few resistances remain, or the root may be on a wrong branch."""
+    """The Jacobian is singular, too few resistances remain, or the root may be on the wrong branch."""
     NON_FINITE = 6
     """A value overflowed, or the resistances were not usable."""
     INVALID_START = 7
-    """F or its Jacobian is not finite at the starting point, which `solve_system` returns unchanged."""
+    """The function or its Jacobian is not finite at the starting point; `solve_system` returns that point."""
     INCONSISTENT = 8
-    """No deformation explains the resistances: χ² is far too large for noise."""
+    """No deformation explains the resistances: χ² is far larger than noise can explain."""
 
 
 _BY_NUMBER = tuple(Status)

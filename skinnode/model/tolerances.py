@@ -1,4 +1,4 @@
-"""Manufacturing tolerances of a patch: how far it may differ from its layout."""
+"""Manufacturing tolerances of a patch: how far it can differ from its layout."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ class Tolerances:
     """Standard deviations of the differences between a real patch and its layout.
 
     Raises:
-        ValueError: If a tolerance is negative, or not below 0.5.
+        ValueError: If a tolerance is negative, not finite, or 0.5 or greater.
     """
 
     placement: float = 0.0
     """Position of each upper and lower wire along each axis, in pitches."""
     thickness: float = 0.0
-    """Rubber thickness between upper and lower electrodes, as a fraction of their smallest distance."""
+    """Rubber thickness between upper and lower electrodes, relative to the smallest distance between them."""
     electrode_radius: float = 0.0
     """Radius of the electrodes, in pitches; the forward model assumes point electrodes."""
     gain: float = 0.0
-    """Gain of the front end for changes in resistance, relative to the nominal gain."""
+    """Front-end gain for changes in resistance, relative to the nominal gain."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not (math.isfinite(value) and 0.0 <= value < 0.5):
-                raise ValueError(f"{entry.name}: got {value}, must be from 0 to below 0.5")
+                raise ValueError(f"{entry.name}: got {value}, must be at least 0 and below 0.5")
 
     @property
     def exact(self) -> bool:

@@ -1,9 +1,9 @@
 """Full-screen view of a running host or a recording: ``skinnode monitor``.
 
 ``source`` takes snapshots of a host or a recording without blocking the host. ``view_model`` converts
-snapshots to an immutable view, with the contacts that ``touches`` finds in a field. ``field_map`` draws
+snapshots to an immutable view, including the contacts that ``touches`` finds in a field. ``field_map`` draws
 fields as text, and ``patch_panel`` and ``screen`` lay out the lines of the screen. ``app`` shows these lines
 and handles keys; ``widgets`` and ``terminal_driver`` send the lines that have changed to the terminal.
-``report`` writes the view as JSON and collects faults. Only ``app``, ``widgets`` and ``terminal_driver``
-require the package textual.
+``session_faults`` collects faults and reports the view as JSON. Only ``app``, ``widgets`` and
+``terminal_driver`` require the textual package.
 """

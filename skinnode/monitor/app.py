@@ -26,9 +26,9 @@ from skinnode.monitor.view_model import History, Level, LogLine, View, log_line,
 from skinnode.monitor.widgets import Canvas, Dialog
 
 PERIOD_S: Final = 0.1
-"""Minimum interval between screen updates, s."""
+"""Minimum interval between screen updates, in seconds."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor core's time that is spent on drawing.
+"""Maximum fraction of one processor core's time spent on drawing.
 
 If drawing is slow, the screen is updated less often.
 """
@@ -43,7 +43,7 @@ HELP: Final = """\
  z, enter          show that patch alone, or all (also esc)
  t, T              tare that patch, or all patches: the current reading becomes zero
  r                 start or stop a recording
- space             freeze the picture; the host continues
+ space             freeze the display; the host continues
  a                 show or hide shear arrows on the maps
  q, ctrl-c         quit
 
@@ -53,14 +53,14 @@ HELP: Final = """\
  sends no data."""
 
 _SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
-"""Names of loggers whose warnings the event log already contains as events."""
+"""Names of loggers whose warnings already appear in the event log as events."""
 
 
 class MonitorApp(App[None]):
-    """Full-screen monitor of a data source.
+    """Full-screen monitor for a data source.
 
     Args:
-        source: Host or recording; the caller closes it.
+        source: Host or recording; the caller must close it.
         folder: Folder for recordings.
         colours: Colours of the terminal.
         over: Function called at each screen update; the monitor ends when it returns True.
@@ -110,7 +110,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Message about each completed tare, and its severity."""
+        """Message and severity for each completed tare."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = source.wall_minus_mono_ns
@@ -142,7 +142,7 @@ class MonitorApp(App[None]):
         assert self._view is not None
         return self._view
 
-    # --- the picture
+    # --- drawing
 
     def _turn(self) -> None:
         """Get the newest view, draw it, and schedule the next update."""
@@ -169,7 +169,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # skip patches that become operational at start-up
+            if not begins:  # skip events for patches that become operational at start-up
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -177,7 +177,7 @@ class MonitorApp(App[None]):
             self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
-        """Draw the view, unless the terminal is still receiving the previous picture."""
+        """Draw the view, unless the terminal is still receiving the previous update."""
         driver = self._driver
         if isinstance(driver, PatientDriver):
             if driver.busy:
@@ -240,7 +240,7 @@ class MonitorApp(App[None]):
         self._draw()
 
     def action_pause(self) -> None:
-        """Freeze or unfreeze the picture."""
+        """Freeze or unfreeze the display."""
         self._paused = not self._paused
         self._draw()
 
@@ -271,7 +271,7 @@ class MonitorApp(App[None]):
         )
 
     def _tare(self, names: list[str]) -> None:
-        """Tare patches on daemon threads, which do not delay the exit of the monitor."""
+        """Tare patches on daemon threads, which do not delay the monitor's exit."""
         self._say(f"{', '.join(names)}: tare requested")
 
         def tare(name: str) -> None:
@@ -321,7 +321,7 @@ class _Records(logging.Handler):
 
 
 def terminal_colours(environment: Mapping[str, str]) -> Colours:
-    """Return the colours of the terminal, as derived by rich from environment variables."""
+    """Return the terminal's colour support, which rich derives from environment variables."""
     from rich.console import Console
 
     if environment.get("NO_COLOR"):

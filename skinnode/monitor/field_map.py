@@ -25,18 +25,18 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 Colours = Literal["rgb", "ansi", "none"]
-"""Colours of the terminal: at least 256 colours, the 16 ANSI colours, or none (NO_COLOR)."""
+"""Colour support of the terminal: at least 256 colours, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
-"""Styled text of a screen line or of part of one."""
+"""Styled text that forms all or part of a screen line."""
 
 MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
-"""Five equidistant points of matplotlib's colour map "magma" (CC0), (5, 3) RGB from 0 to 255.
+"""Five equally spaced colours of matplotlib's "magma" colour map (CC0), (5, 3) RGB from 0 to 255.
 
-The perceived brightness of the colour map increases uniformly.
+Perceived brightness increases uniformly along the colour map.
 """
 UNKNOWN_RGB: Final = (74, 78, 88)
-"""Colour where the depth is unknown."""
+"""Colour of pixels whose depth is unknown."""
 LEVELS: Final = 24
 """Number of shades. More shades would look the same but take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
@@ -55,14 +55,14 @@ _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum depth at full brightness, m. With a smaller minimum, noise would look like a touch."""
+"""Minimum depth (m) at full brightness. With a smaller minimum, noise would look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which a press that has ended still affects the brightness scale, ns."""
+"""Time (ns) for which a press continues to affect the brightness scale after it has ended."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Quantities drawn on the map of a field: (U, N) arrays in metres, upper wire 0 first."""
+    """Quantities drawn on a field map: (U, N) arrays in metres, upper wire 0 first."""
 
     depth_m: Float
     """Depth, positive where the skin is pressed inwards."""
@@ -76,12 +76,12 @@ class Surface:
 
     @property
     def deepest_m(self) -> float:
-        """Maximum known depth, m."""
+        """Maximum known depth, in metres."""
         return float(np.max(self.depth_m, initial=0.0, where=~self.unknown))
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """Return the quantities to draw on the map of a field.
+    """Return the quantities to draw on a field map.
 
     Args:
         field: Newest field of the patch.
@@ -99,7 +99,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
 
 def aspect_of(upper_m: Float) -> float:
-    """Return the width-to-height ratio of a patch whose electrodes are the centres of equal cells."""
+    """Return a patch's width-to-height ratio, treating the electrodes as the centres of equal cells."""
     wires, electrodes = upper_m.shape[:2]
     width, height = np.ptp(upper_m[..., :2].reshape(-1, 2), axis=0)
     width, height = width / max(electrodes - 1, 1) * electrodes, height / max(wires - 1, 1) * wires
@@ -107,14 +107,14 @@ def aspect_of(upper_m: Float) -> float:
 
 
 def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """Return the size of the largest map in a box of characters, which are twice as high as wide."""
+    """Return the size of the largest map that fits in a box; characters are twice as high as wide."""
     across = min(width, round(2 * height * aspect))
     return max(2, across), max(1, min(height, round(across / (2 * aspect))))
 
 
 @functools.lru_cache(maxsize=64)
 def _weights(size: int, n: int) -> Float:
-    """Return the weights (size, n) that interpolate ``size`` pixels linearly between n electrodes."""
+    """Return (size, n) weights that interpolate linearly from n electrodes to ``size`` pixels."""
     at = np.clip((np.arange(size) + 0.5) / size * n - 0.5, 0.0, n - 1)
     low = np.minimum(at.astype(int), max(n - 2, 0))
     made = np.zeros((size, n))
@@ -124,18 +124,18 @@ def _weights(size: int, n: int) -> Float:
 
 
 def resample(grid: Float, width: int, height: int) -> Float:
-    """Interpolate a (U, N) grid to a (height, width) picture, in which upper wire 0 is the last row."""
+    """Interpolate a (U, N) grid to a (height, width) image in which upper wire 0 is the last row."""
     rows, columns = _weights(height, grid.shape[0]), _weights(width, grid.shape[1])
     return np.asarray((rows @ grid @ columns.T)[::-1])
 
 
 def arrow(x: float, y: float) -> str:
-    """Return the arrow, one of eight, closest to the direction (x, y)."""
+    """Return whichever of the eight arrows is closest to the direction (x, y)."""
     return ARROWS[round(math.atan2(y, x) / (math.pi / 4)) % 8]
 
 
 def mean_shear_m(surface: Surface) -> tuple[float, float]:
-    """Return the depth-weighted mean shear (x, y), in m; zero if nothing presses on the patch."""
+    """Return the depth-weighted mean shear (x, y) in m; zero if nothing is pressing on the patch."""
     weight = np.where(surface.unknown, 0.0, np.clip(surface.depth_m, 0.0, None))
     total = float(weight.sum())
     if total <= 0.0:
@@ -145,7 +145,7 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Brightness scale of the maps; full brightness is the depth of the deepest recent press, rounded up.
+    """Brightness scale of the maps; full brightness is the maximum depth of recent presses, rounded up.
 
     All patches share one scale, so that their maps are comparable.
     """
@@ -155,7 +155,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Update the scale with ``deepest_m``, the maximum depth at ``t_ns``, m."""
+        """Update the scale with ``deepest_m``, the maximum depth (m) at ``t_ns``."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -167,15 +167,15 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class MapStyle:
-    """How maps are drawn."""
+    """Parameters that determine how maps are drawn."""
 
     full_m: float
-    """Depth drawn brightest, m."""
+    """Depth drawn at full brightness, in metres."""
     colours: Colours
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m; a quarter of the depth, because shear is smaller than depth."""
+        """Shear (m) drawn at full brightness; a quarter of that depth, because shear is smaller."""
         return 0.25 * self.full_m
 
 

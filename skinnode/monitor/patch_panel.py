@@ -1,4 +1,4 @@
-"""Renders a patch as one of several tiles, or alone with all its values."""
+"""Renders a patch as one of several tiles, or on its own with all its values."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting"
 _AROUND: Final = 3
 """Number of lines in a tile, excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
-"""Minimum size of a box whose map has an outline, in characters and lines."""
+"""Minimum size of a box in which the map has an outline: width in characters, height in lines."""
 _LABEL: Final = 10
-"""Width of the column of value names, in characters."""
+"""Width of the value-name column, in characters."""
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw all patches as tiles within ``height`` lines, in the columns that give the largest maps."""
+    """Draw all patches as tiles in ``height`` lines, choosing the number of columns for the largest maps."""
     theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the height in lines of a map that has ``columns`` columns of tiles."""
+        """Return the height of a map, in lines, if the tiles are arranged in ``columns`` columns."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -126,7 +126,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw a line with the patch's most severe fault or, without a fault, its field rate."""
+    """Draw a line that shows the patch's most severe fault or, if it has no fault, its field rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
@@ -143,7 +143,7 @@ def _health(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def shear_text(shear_m: tuple[float, float]) -> str:
-    """Return a shear, given in m, as an arrow and a magnitude; empty below 1 µm."""
+    """Format a shear in metres as an arrow and a magnitude; return an empty string below 1 µm."""
     size_um = 1e6 * float((shear_m[0] ** 2 + shear_m[1] ** 2) ** 0.5)
     return "" if size_um < 1.0 else f"{field_map.arrow(*shear_m)} {size_um:.0f} µm"
 
@@ -256,7 +256,7 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _span(seconds: float) -> str:
-    """Return a duration as text in a suitable unit."""
+    """Format a duration in a suitable unit."""
     if seconds < 1.0:
         return f"{1e3 * seconds:.0f} ms"
     if seconds < 120.0:

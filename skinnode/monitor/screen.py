@@ -197,11 +197,11 @@ def _touch_line(patch: PatchView, touch: Touch, theme: Theme, name: int) -> Line
 
 
 def _quiet(view: View) -> str:
-    """Return the text for an empty event log, with any faults that occurred before the log began."""
+    """Return the text for an empty event log, including any faults that occurred before the log began."""
     wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:
-        return f" no event yet; earlier faults: {', '.join(wrong)}"
+        return f" no events yet; earlier faults: {', '.join(wrong)}"
     lost = any(_losses(view, bus) for bus in view.buses)
     return " no event" if lost else " nothing happened"
 

@@ -15,21 +15,21 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time within which all patches of a running hand must become operational, ns."""
+"""Time (ns) within which all patches of a running hand must become operational."""
 
 LOOK_S: Final = 0.1
-"""Interval between checks of the source for faults, s."""
+"""Interval between checks of the source for faults, in seconds."""
 
 LINE_S: Final = 1.0
-"""Interval between JSON lines, s."""
+"""Interval between JSON lines, in seconds."""
 
 
 class FaultBook:
     """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
-        live: Whether the source is a running hand, whose patches must be operational soon after the start. A
-            recording may begin before its patches are started, so they are checked only at the end.
+        live: Whether the source is a running hand, whose patches must be operational soon after start-up. A
+            recording can begin before its patches are started, so they are checked only at the end.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -49,7 +49,8 @@ class FaultBook:
         Args:
             view: Current view of the hand.
             real_ns: Monotonic time of the monitor, ns.
-            ending: Whether the session is ending; a patch that has never been operational is then a fault.
+            ending: Whether the session is ending; a patch that has never been operational then counts as a
+                fault.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
@@ -73,7 +74,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return pairs (key, text) for wire faults, a duplicate node-ID and the last EMCY of a patch."""
+    """Return (key, text) pairs for wire faults, a duplicate node-ID and the last EMCY of a patch."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -96,7 +97,7 @@ def watch(
         faults: Faults of the session, updated at each check.
 
     Raises:
-        SkinError: The source failed.
+        SkinError: If the source has failed.
     """
     begun_s = due_s = time.monotonic()
     due_s += LINE_S

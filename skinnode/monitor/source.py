@@ -32,10 +32,10 @@ _EVENTS: Final = 500
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of a hand at one instant; the mappings are keyed by the name of a patch or bus."""
+    """State of a hand at one instant; the mappings are keyed by patch or bus name."""
 
     t_ns: int
-    """Time on the monotonic clock of the host or, for a recording, of the host that made it, ns."""
+    """Time in ns on the monotonic clock of the host or, for a recording, of the host that made it."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -56,7 +56,7 @@ class Recording:
 class Source(Protocol):
     """Protocol implemented by the monitor's data sources.
 
-    All methods return immediately, except record and stop_recording.
+    All methods except ``record`` and ``stop_recording`` return immediately.
     """
 
     hand: HandConfig
@@ -68,17 +68,17 @@ class Source(Protocol):
         """Return the current state of the hand. Raises SkinError if the source has failed."""
 
     def events(self) -> list[HealthEvent]:
-        """Return the events since the last call."""
+        """Return the events that have occurred since the last call."""
 
     def fields(self, capacity: int) -> Subscription:
-        """Subscribe to the fields of all patches; a full queue of ``capacity`` fields drops its oldest."""
+        """Subscribe to the fields of all patches; the queue keeps the newest ``capacity`` fields."""
 
     def now_ns(self) -> int:
-        """Return the current time on the monotonic clock of the times in snapshots, ns."""
+        """Return the current time in ns on the monotonic clock used in snapshots."""
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Difference between the wall clock and the monotonic clock of the times in snapshots, ns."""
+        """Wall-clock time minus the time on the monotonic clock used in snapshots, in ns."""
 
     @property
     def over(self) -> bool:
@@ -133,7 +133,7 @@ class HostSource(Closing):
         )
 
     def events(self) -> list[HealthEvent]:
-        """Return the events since the last call."""
+        """Return the events that have occurred since the last call."""
         return drain(self._events)
 
     def fields(self, capacity: int) -> Subscription:
@@ -141,12 +141,12 @@ class HostSource(Closing):
         return self._host.fields(capacity=capacity)
 
     def now_ns(self) -> int:
-        """Return the current time, ns."""
+        """Return the current time in ns."""
         return clock.monotonic_ns()
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Difference between the wall clock and the monotonic clock, ns."""
+        """Wall-clock time minus monotonic time, in ns."""
         return clock.time_ns() - clock.monotonic_ns()
 
     @property
@@ -156,7 +156,7 @@ class HostSource(Closing):
 
     @property
     def flaws(self) -> list[str]:
-        """Flaws of the recording."""
+        """Flaws in the recording."""
         return []
 
     def tare(self, patch: str) -> None:
@@ -197,7 +197,7 @@ class HostSource(Closing):
 
 
 class ReplaySource(Closing):
-    """Data source that replays a recording on a separate thread, from construction to :meth:`close`."""
+    """Data source that replays a recording on a separate thread, from construction until :meth:`close`."""
 
     live = False
 
@@ -227,7 +227,7 @@ class ReplaySource(Closing):
         return snapshot_of(self._run)
 
     def events(self) -> list[HealthEvent]:
-        """Return the events since the last call."""
+        """Return the events that have occurred since the last call."""
         return drain(self._events)
 
     def fields(self, capacity: int) -> Subscription:
@@ -235,12 +235,12 @@ class ReplaySource(Closing):
         return self._run.publisher.subscribe(capacity, None, None)
 
     def now_ns(self) -> int:
-        """Return the current replay time on the recording host's monotonic clock, ns."""
+        """Return the current replay time in ns on the recording host's monotonic clock."""
         return self._run.clock()
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Difference between the wall clock and the monotonic clock of the recording host, ns."""
+        """Wall-clock time minus monotonic time on the recording host, in ns."""
         return self._run.wall_minus_mono_ns
 
     @property
@@ -250,7 +250,7 @@ class ReplaySource(Closing):
 
     @property
     def flaws(self) -> list[str]:
-        """Flaws of the recording."""
+        """Flaws in the recording."""
         return self._run.flaws
 
     def tare(self, patch: str) -> None:

@@ -19,14 +19,14 @@ _MAX_QUEUED: Final = 30
 """Maximum number of writes queued for the terminal, enough for a few screen updates."""
 
 _END_S: Final = 1.0
-"""Maximum wait at exit for the terminal to accept queued output, s."""
+"""Maximum time (s) to wait at exit for the terminal to accept queued output."""
 
 
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    The thread bypasses ``sys.stdout``: a blocked write would hold the lock of ``sys.stdout``, for which the
-    interpreter waits at exit.
+    The thread bypasses ``sys.stdout``: a blocked write would hold its lock, and the interpreter waits for
+    that lock at exit.
     """
 
     def __init__(self, descriptor: int, gone: threading.Event) -> None:
@@ -45,9 +45,9 @@ class _Writer(threading.Thread):
                     self._gone.set()
 
     def end(self) -> None:
-        """End the thread when the queue is empty.
+        """End the thread once the queue is empty.
 
-        A thread that is blocked by a stalled terminal ends with the process.
+        A thread blocked by a stalled terminal ends with the process.
         """
         with suppress(queue.Full):
             self.queue.put_nowait(None)
@@ -90,7 +90,7 @@ class PatientDriver(LinuxDriver):
 
     @property
     def deaf(self) -> bool:
-        """Whether the terminal no longer exists, or did not accept all output before it was closed."""
+        """Whether the terminal no longer exists or did not accept all output before the driver closed."""
         return self.gone or (self._writer is not None and self._writer.is_alive())
 
     def run_input_thread(self) -> None:

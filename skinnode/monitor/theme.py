@@ -1,4 +1,4 @@
-"""Provides the styles of the screen, the state of the user interface, and the layout of styled text."""
+"""Defines screen styles and the state of the user interface, and lays out styled text."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Theme:
     bad: Style
     chosen: Style
     alarm: Style
-    """Style of the labels for a recording, a pause or a lost patch."""
+    """Style of the labels that mark a recording, a pause or a lost patch."""
     gauge: Style
 
     def of(self, level: Level) -> Style:
@@ -104,7 +104,7 @@ class Paint:
     theme: Theme
     ui: UiState
     full_m: float
-    """Depth drawn at full brightness, m."""
+    """Depth drawn at full brightness, in metres."""
 
     @property
     def map_style(self) -> MapStyle:
@@ -113,7 +113,7 @@ class Paint:
 
 
 def pad(line: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Return ``line`` cut or padded to ``width`` characters."""
+    """Return ``line`` truncated or padded to ``width`` characters."""
     made, left = [], width
     for segment in line:
         if left <= 0:
@@ -134,7 +134,7 @@ def width_of(line: Line) -> int:
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Join ``left`` and the right-aligned ``right`` into one line, cutting ``left`` if they do not fit."""
+    """Join ``left`` and the right-aligned ``right`` into one line, truncating ``left`` if they do not fit."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 
@@ -152,6 +152,6 @@ def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) 
 
 
 def centred(line: Line, width: int, theme: Theme) -> Line:
-    """Centre ``line`` in ``width`` characters."""
+    """Centre ``line`` within ``width`` characters."""
     left = max(0, width - width_of(line)) // 2
     return pad([Segment(" " * left, theme.text), *line], width, theme)

@@ -1,4 +1,4 @@
-"""Finds the contacts on a patch in its displacement field."""
+"""Finds the contacts on a patch from its displacement field."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of an electrode within a touch, as a fraction of the maximum depth. In a Hertzian contact,
-the rim is half as deep as the centre."""
+"""Minimum depth at which an electrode belongs to a touch, as a fraction of the maximum depth. In a Hertzian
+contact, the rim is half as deep as the centre."""
 SURE: Final = 6.0
-"""Minimum depth of an electrode within a touch, as a multiple of its standard deviation. With 100 electrodes,
-noise alone exceeds this limit in one of 10 million fields."""
+"""Minimum depth at which an electrode belongs to a touch, as a multiple of its standard deviation. With 100
+electrodes, noise alone exceeds this limit in one in 10 million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
@@ -40,7 +40,7 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    The contacts are taken from the field. A field of the exact inverse may contain none, for example in an
+    The contacts are taken from the field. A field from the exact inverse may contain none, for example in an
     old recording. Each connected region of pressed skin then counts as a contact, whose force is known only
     if a stiffness was specified.
 
@@ -67,7 +67,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
 
 def _depth_at(field: FieldFrame, rest_m: Float, place_m: Float) -> float:
-    """Return the depth at the electrode closest to a position, m."""
+    """Return the depth in m at the electrode closest to a position."""
     away = np.hypot(rest_m[..., 0] - place_m[0], rest_m[..., 1] - place_m[1])
     return float(-field.displacement_m[..., 2].flat[int(away.argmin())])
 

@@ -1,4 +1,4 @@
-"""Computes the content of the screen from snapshots, as immutable data."""
+"""Computes the screen content from snapshots as immutable data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from skinnode.monitor.touches import Touch, touches_of
 Level = Literal["good", "note", "bad"]
 """Severity of a condition: ``good`` for no fault, ``note`` for a condition to check, ``bad`` for a fault."""
 HISTORY_NS: Final = 2_000_000_000
-"""Period over which rates and latencies are computed, ns."""
+"""Period over which rates and latencies are computed, in ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ class PatchView:
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
-    """Median time from the arrival of a scan's last CAN frame until its field was ready, s."""
+    """Median time in seconds from the arrival of a scan's last CAN frame until its field is ready."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool
@@ -56,16 +56,16 @@ class PatchView:
     """Reason why the newest field is not trusted; empty if the field is trusted or does not exist."""
     precise: bool
     data_share: float | None
-    """Fraction of the maximum depth that comes from the data, not the prior; None without a field."""
+    """Fraction of the maximum depth that comes from the data, not the prior; None if there is no field."""
     data_faults: tuple[DataFault, ...]
     """Faulty readings excluded from the newest field."""
     method: str
     surface: Surface | None
     depth_m: float | None
     depth_std_m: float | None
-    """Standard deviation of the deepest electrode's depth, m."""
+    """Standard deviation of the deepest electrode's depth, in metres."""
     shear_m: tuple[float, float]
-    """Mean shear (x, y), weighted by depth, m."""
+    """Depth-weighted mean shear (x, y) in metres."""
     touches: tuple[Touch, ...]
 
 
@@ -101,7 +101,7 @@ class View:
 
     @property
     def deepest_m(self) -> float:
-        """Depth of the deepest press on any patch, m."""
+        """Depth of the deepest press on any patch, in metres."""
         return max((patch.depth_m or 0.0 for patch in self.patches), default=0.0)
 
     def patch(self, name: str) -> PatchView:
@@ -111,7 +111,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """Entry of the event log: an event and its time of day."""
+    """Entry in the event log: an event and its time of day."""
 
     time: str
     subject: str
@@ -130,7 +130,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # in a recording, the clock may be set back
+            kept.clear()  # in a recording, the clock can go backwards
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -208,7 +208,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
-    """Return the latencies of a patch's fields in the given snapshots, s."""
+    """Return the latencies, in seconds, of a patch's fields in the given snapshots."""
     found: dict[int, float] = {}
     since_ns = history[-1].t_ns - HISTORY_NS
     for snapshot in history:
@@ -221,7 +221,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return the electrode positions (U, N, 3) at rest according to the hand file, m.
+    """Return the (U, N, 3) electrode positions at rest, in m, according to the hand file.
 
     The positions stored in the patch may differ.
     """
@@ -231,7 +231,7 @@ def upper_m(layout: LayoutConfig) -> Float:
 def judge_patch(
     health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
-    """Return the condition of a patch, its severity, and descriptions of the patch's faults."""
+    """Return the condition of a patch, its severity, and descriptions of its faults."""
     condition = health.condition
     if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()
@@ -315,12 +315,12 @@ def _bus_view(
 
 
 def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
-    """Return an event as a line of the event log."""
+    """Format an event as a line for the event log."""
     return LogLine(time_of_day(event.t_ns + wall_minus_mono_ns), event.subject, event.text, event.severity)
 
 
 def time_of_day(t_ns: int) -> str:
-    """Convert a wall-clock time in ns to text: the local time of day, to the second."""
+    """Format a wall-clock time in ns as the local time of day, to the second."""
     import datetime
 
     return datetime.datetime.fromtimestamp(t_ns * 1e-9).strftime("%H:%M:%S")

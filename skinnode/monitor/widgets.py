@@ -17,13 +17,13 @@ from textual.widgets import Static
 from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
-"""Function that returns the lines of a picture of the given width and height."""
+"""Function that returns the lines to draw, given the width and height of the canvas."""
 
 
 class Canvas(Widget):
-    """Canvas that draws the lines of a painter and sends only changed lines to the terminal.
+    """Canvas that draws a painter's lines and sends only changed lines to the terminal.
 
-    Textual's own widgets would redraw the whole picture on each update.
+    Textual's own widgets would redraw the whole canvas on each update.
     """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
@@ -34,7 +34,7 @@ class Canvas(Widget):
         self._strips: list[Strip] = []
 
     def show(self, painter: Painter) -> None:
-        """Replace the painter, and redraw the canvas."""
+        """Replace the painter and redraw the canvas."""
         self._painter = painter
         self._paint()
 
@@ -49,7 +49,7 @@ class Canvas(Widget):
         self._paint()
 
     def render_line(self, y: int) -> Strip:
-        """Return line ``y``, for Textual to draw."""
+        """Return line ``y`` for Textual to draw."""
         return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
 
     def _paint(self) -> None:
@@ -68,7 +68,7 @@ class Canvas(Widget):
 
 
 class Dialog(ModalScreen[bool]):
-    """Text in a box. ``enter`` or ``y`` answers a question with True, any other key with False."""
+    """Text in a box. ``enter`` or ``y`` answers a question with True; any other key answers it with False."""
 
     CSS = """
     Dialog { align: center middle; background: $background 40%; }
@@ -98,6 +98,6 @@ class Dialog(ModalScreen[bool]):
     def on_key(self, event: Key) -> None:
         """Close the box and return the answer."""
         event.stop()
-        if not self._answered:  # more keys may arrive while the box closes
+        if not self._answered:  # more keys may arrive while the box is closing
             self._answered = True
             self.dismiss(self._question and event.key in ("y", "enter"))

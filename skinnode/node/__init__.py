@@ -1,4 +1,4 @@
-"""CANopen node (CiA 301) of a patch, and the thread that runs nodes on a bus.
+"""CANopen node (CiA 301) for a patch, and the thread that runs nodes on a bus.
 
 ``runner`` contains the thread, which passes received frames to ``device``. The device passes each frame to
 the service that handles it; every service has its own module. The sub-package ``patch`` is the application,

@@ -21,7 +21,7 @@ class Application(Protocol):
         ...
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application at power-on, before the boot-up message. Not called at a reset."""
+        """Start the application at power-on, before the boot-up message. Not called on a reset."""
         ...
 
     def reset(self) -> None:
@@ -29,11 +29,11 @@ class Application(Protocol):
         ...
 
     def enter(self, *, operational: bool) -> None:
-        """Handle an NMT state change to OPERATIONAL or to another state."""
+        """Handle an NMT state change into or out of OPERATIONAL."""
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL. ``turns`` contains the numbers of the synchronous TPDOs now due."""
+        """Handle a SYNC in OPERATIONAL. ``turns`` contains the numbers of the due synchronous TPDOs."""
         ...
 
     def on_timer(self, t_ns: int) -> None:
@@ -43,7 +43,7 @@ class Application(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ApplicationServices:
-    """Services of a device for its application."""
+    """Services that a device provides to its application."""
 
     store: ObjectStore
     """Object dictionary."""

@@ -3,8 +3,8 @@
 The device has no thread and reads no clock, so its behaviour is deterministic. The caller passes received
 frames and their arrival times to :meth:`CanopenDevice.on_frame`, and calls :meth:`CanopenDevice.on_timer` at
 the time given by :meth:`CanopenDevice.next_deadline_ns`. On a bus, :class:`~skinnode.node.runner.NodeRunner`
-is the caller. The device handles every frame without an exception. Exceptions from the application and from
-``send`` propagate to the caller.
+is the caller. The device handles every frame without raising an exception. Exceptions from the application
+and from ``send`` propagate to the caller.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ Handler = Callable[[bytes, int], None]
 
 
 class CanopenDevice:
-    """CANopen device. It is silent until :meth:`power_on`.
+    """CANopen device. It is silent until :meth:`power_on` is called.
 
     Args:
         node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
             memory takes precedence.
-        objects: declarations of the node's object dictionary.
-        application: function that creates the application, given the device's services.
-        send: function that sends a frame, given its COB-ID and payload.
-        serial: serial number (0x1018:4), u32.
-        memory: non-volatile memory of the device, or None.
-        kind: identifier of the sizes and layout of the patch. Memory content that was saved with another
-            identifier is not used.
-        set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
+        objects: Declarations of the objects in the node's object dictionary.
+        application: Function that creates the application, given the device's services.
+        send: Function that sends a frame, given its COB-ID and payload.
+        serial: Serial number (0x1018:4), u32.
+        memory: Non-volatile memory of the device, or None.
+        kind: Identifier of the patch's sizes and layout. Memory contents saved with another identifier are
+            not used.
+        set_bit_rate: Function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: If an argument is out of range.
     """
 
     def __init__(  # noqa: PLR0913 - the keywords of the public PatchNode, passed on
@@ -113,7 +113,7 @@ class CanopenDevice:
         """Start the application and boot. A device without a node-ID first waits until LSS assigns one.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         self._now_ns = t_ns
         self._storage.load()
@@ -134,10 +134,10 @@ class CanopenDevice:
         """Handle a frame with an 11-bit identifier.
 
         Args:
-            can_id: identifier of the frame.
-            data: payload of the frame; ignored for a remote frame.
-            t_ns: arrival time, ns.
-            remote: whether the frame is a remote frame.
+            can_id: Identifier of the frame.
+            data: Payload of the frame; ignored for a remote frame.
+            t_ns: Arrival time, ns.
+            remote: Whether the frame is a remote frame.
         """
         if self._bit_rate_change.silent(t_ns):
             return
@@ -157,12 +157,12 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change in the CAN controller's state.
 
-        At bus-off, the error behaviour (0x1029) takes effect immediately. The emergency message follows when
+        At bus-off, the error behaviour (0x1029) takes effect immediately. The emergency message follows once
         the bus has recovered.
 
         Args:
-            state: new state of the CAN controller.
-            t_ns: current time, ns.
+            state: New state of the CAN controller.
+            t_ns: Current time, ns.
         """
         was, self._bus_state = self._bus_state, state
         if self.nmt_state is NmtState.INITIALISING or state is was:
@@ -202,10 +202,10 @@ class CanopenDevice:
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Perform all actions that are due at ``t_ns``. Before the next deadline, this has no effect.
+        """Perform all actions that are due at ``t_ns``. Calls before the next deadline have no effect.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:
             return
@@ -243,7 +243,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Reset the objects and services, and boot unless the node has no node-ID."""
+        """Reset the objects and services, and boot if the node has a node-ID."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -308,7 +308,7 @@ class CanopenDevice:
             self._synchronise(data, t_ns)
 
     def _synchronise(self, sync: bytes, t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL: apply RPDOs, then call the application, then send TPDOs."""
+        """Handle a SYNC received in OPERATIONAL: apply RPDOs, call the application, then send TPDOs."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
@@ -363,7 +363,7 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Rebuild the table of handlers for all received COB-IDs except those of RPDOs."""
+        """Rebuild the table of handlers for all received COB-IDs except the RPDO COB-IDs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time

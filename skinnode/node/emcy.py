@@ -1,4 +1,4 @@
-"""EMCY producer (CiA 301 v4.2, 7.2.7), with the objects 0x1001, 0x1003, 0x1014 and 0x1015."""
+"""EMCY producer (CiA 301 v4.2, 7.2.7), including objects 0x1001, 0x1003, 0x1014 and 0x1015."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class EmcyProducer:
     """EMCY producer of a node, which reports the beginning and the end of each error.
 
     Args:
-        store: object dictionary.
-        send: function that sends a frame, given its COB-ID and payload.
+        store: Object dictionary.
+        send: Function that sends a frame, given its COB-ID and payload.
     """
 
     def __init__(self, store: ObjectStore, send: Callable[[int, bytes], None]) -> None:
@@ -54,12 +54,12 @@ class EmcyProducer:
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report an error and its end at the same time.
+        """Report an error, immediately followed by its end.
 
         Args:
-            code: error code.
-            detail: up to five manufacturer-specific bytes.
-            t_ns: current time, ns.
+            code: Error code.
+            detail: Up to five manufacturer-specific bytes.
+            t_ns: Current time, ns.
         """
         self._send_error(code, self.register | code.register_bit | 1, detail, t_ns)
         self._send_end(code, t_ns)
@@ -68,10 +68,10 @@ class EmcyProducer:
         """Report an error that lasts until :meth:`clear`. Repeated calls with the same detail have no effect.
 
         Args:
-            code: error code.
-            detail: up to five manufacturer-specific bytes.
-            t_ns: current time, ns.
-            who: number that distinguishes independent errors with the same code.
+            code: Error code.
+            detail: Up to five manufacturer-specific bytes.
+            t_ns: Current time, ns.
+            who: Number that distinguishes independent errors with the same code.
         """
         if self._present.get((code, who)) != detail:
             self._present[code, who] = detail
@@ -81,15 +81,15 @@ class EmcyProducer:
         """Report the end of an error. If the error is not active, do nothing.
 
         Args:
-            code: error code.
-            t_ns: current time, ns.
-            who: as in :meth:`report`.
+            code: Error code.
+            t_ns: Current time, ns.
+            who: As in :meth:`report`.
         """
         if self._present.pop((code, who), None) is not None:
             self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Allow or forbid sending messages, depending on the NMT state of the node."""
+        """Enable or disable sending, depending on the NMT state of the node."""
         self._allowed = allowed
         self._try(t_ns)
 
@@ -119,7 +119,7 @@ class EmcyProducer:
         self._queue(_message(code, register, detail), t_ns)
 
     def _send_end(self, code: EmcyCode, t_ns: int) -> None:
-        """Queue a message for the end of an error, with an error register of the remaining errors."""
+        """Queue a message for the end of an error; its error register shows the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
@@ -136,7 +136,7 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send queued messages. If the bus refuses one, it is sent at a later timer event.
+        """Send queued messages. If the bus refuses a message, it is sent at a later timer event.
 
         No BusError is raised, because the caller is still handling the error that it reports.
         """
@@ -146,8 +146,8 @@ class EmcyProducer:
     def _loss(self) -> bytes:
         """Return an emergency message (0x8110) that reports the number of dropped emergency messages.
 
-        The number is in detail bytes 2 and 3. Detail bytes 0 and 1 are 0, which distinguishes this message
-        from one about skipped scans, where they contain the number of skipped scans.
+        The number is in detail bytes 2 and 3. Detail bytes 0 and 1 are 0 to distinguish this message from one
+        about skipped scans, in which they contain the number of skipped scans.
         """
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
@@ -155,7 +155,7 @@ class EmcyProducer:
 
     @property
     def _free_ns(self) -> int:
-        """End of the inhibit time of the last message, ns."""
+        """Time (ns) at which the inhibit time of the last message ends."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary
@@ -174,7 +174,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return a sub-index of the error history: the number of entries (0), or an entry, newest first."""
+        """Return a sub-index of the error history: the number of entries (0) or an entry (1 = newest)."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):

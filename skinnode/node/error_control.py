@@ -23,8 +23,8 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. The other
-node may lose a heartbeat without ending the conflict."""
+"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. The loss
+of one heartbeat from the other node does not end the conflict."""
 _RIVAL_NS: Final = 750_000_000
 """Duration of silence (ns) after which a node-ID conflict is considered resolved if this node sends no
 heartbeats. It equals three default heartbeat periods.
@@ -35,9 +35,9 @@ class ErrorControl:
     """Error control services of a node.
 
     Args:
-        services: resources that all services of the node share.
-        listen: callback for a change of :meth:`handlers`.
-        failed: callback for a heartbeat event or life guarding event, given its time in ns.
+        services: Resources that all services of the node share.
+        listen: Callback for a change in the result of :meth:`handlers`.
+        failed: Callback for a heartbeat event or life guarding event, given its time in ns.
     """
 
     def __init__(
@@ -84,10 +84,10 @@ class ErrorControl:
         return handlers
 
     def reset(self, node_id: int) -> None:
-        """Reset all error control services, and forget all received heartbeats and guarding requests.
+        """Reset all error control services and forget all received heartbeats and guarding requests.
 
         Args:
-            node_id: node-ID of this node.
+            node_id: Node-ID of this node.
         """
         self._cob_id = od.heartbeat_cob_id(node_id)
         self._rival_until_ns = NO_DEADLINE_NS

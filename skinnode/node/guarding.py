@@ -1,4 +1,4 @@
-"""Node guarding and life guarding (CiA 301 v4.2, 7.2.8.3.2.1), with the objects 0x100C and 0x100D."""
+"""Node guarding and life guarding (CiA 301 v4.2, 7.2.8.3.2.1), including objects 0x100C and 0x100D."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from skinnode.node.pacing import NO_DEADLINE_NS
 
 
 class Guarding:
-    """Guarding slave: answers guarding requests, and reports a life guarding event when they stop.
+    """Guarding slave: answers guarding requests and reports a life guarding event when they stop.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
         emcy: EMCY producer of the node.
-        failed: callback for a life guarding event, given its time in ns.
+        failed: Callback for a life guarding event, given its time in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -35,11 +35,11 @@ class Guarding:
         self.deadline_ns = NO_DEADLINE_NS
 
     def answer(self, state: NmtState, t_ns: int) -> bytes:
-        """Return the answer to a guarding request, and restart the node life time.
+        """Return the answer to a guarding request and restart the node life time.
 
         Args:
             state: NMT state of the node.
-            t_ns: arrival time of the request, ns.
+            t_ns: Arrival time of the request, ns.
         """
         answer = bytes((state | self._toggle,))
         self._toggle ^= GUARD_TOGGLE

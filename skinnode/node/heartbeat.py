@@ -15,16 +15,16 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pacing import NO_DEADLINE_NS
 
 _BOOTED: Final = 1
-"""Second manufacturer-specific byte of the emergency message if a monitored node has restarted; 0 if its
-heartbeat is overdue."""
+"""Second manufacturer-specific byte of the emergency message for a monitored node that has restarted; the
+byte is 0 if a heartbeat is overdue."""
 
 
 class HeartbeatProducer:
-    """Schedule of a node's heartbeats. A delay of a whole period or more shifts the schedule."""
+    """Schedule of a node's heartbeats. A delay of one period or more shifts the schedule."""
 
     def __init__(self) -> None:
         self.period_ns = 0
-        """Heartbeat period, ns; 0 if the node sends no heartbeats."""
+        """Heartbeat period in ns; 0 if the node sends no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
         """Time (ns) at which the next heartbeat must be sent."""
 
@@ -32,8 +32,8 @@ class HeartbeatProducer:
         """Start the schedule. The first heartbeat is due one period after the boot-up message.
 
         Args:
-            period_ms: heartbeat period, ms; 0 for no heartbeats.
-            t_ns: time of the boot-up message, ns.
+            period_ms: Heartbeat period, ms; 0 for no heartbeats.
+            t_ns: Time of the boot-up message, ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
@@ -42,8 +42,8 @@ class HeartbeatProducer:
         """Change the heartbeat period. A heartbeat is due immediately.
 
         Args:
-            period_ms: heartbeat period, ms; 0 for no heartbeats.
-            t_ns: current time, ns.
+            period_ms: Heartbeat period, ms; 0 for no heartbeats.
+            t_ns: Current time, ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
@@ -70,9 +70,9 @@ class HeartbeatConsumer:
     """Monitors the nodes listed in 0x1016.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
         emcy: EMCY producer of the node.
-        failed: callback for a missed heartbeat, given its time in ns.
+        failed: Callback for a missed heartbeat, given its time in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -88,12 +88,12 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Apply 0x1016 after a reset, and forget all received heartbeats."""
+        """Apply 0x1016 after a reset and forget all received heartbeats."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Apply a write to 0x1016. Monitoring by a changed entry starts at the next heartbeat."""
+        """Apply a write to 0x1016. For a changed entry, monitoring starts at the next heartbeat."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -114,9 +114,9 @@ class HeartbeatConsumer:
         booted. While a node is monitored, a boot-up message means that it has restarted.
 
         Args:
-            node_id: node-ID of the monitored node.
+            node_id: Node-ID of the monitored node.
             state: NMT state in the message.
-            t_ns: arrival time, ns.
+            t_ns: Arrival time, ns.
         """
         item = self._monitored[node_id]
         if state == NmtState.INITIALISING:
@@ -128,7 +128,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report the monitored nodes whose heartbeat has become overdue."""
+        """Report the monitored nodes whose heartbeats have become overdue."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():

@@ -1,6 +1,6 @@
 """LSS slave (CiA 305 v3.0), through which a master finds nodes and sets their node-IDs and bit rates.
 
-The slave turns requests into responses, and accesses neither a bus nor a clock. It handles requests in every
+The slave turns requests into responses and accesses neither a bus nor a clock. It handles requests in every
 NMT state. A node without a node-ID handles no other requests.
 """
 
@@ -28,7 +28,7 @@ _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
 """Error codes in responses. The meaning of code 1 depends on the request."""
 
 
-# Part of the LSS address, and comparison, for each request of *switch state selective* and *identify*.
+# LSS address part and comparison for each request of *switch state selective* and *identify*.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -49,12 +49,12 @@ class LssSlave:
 
     Args:
         address: LSS address, from the identity object (0x1018).
-        node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
-        bit_rates_bps: supported bit rates, bit/s; empty if the bit rate cannot be changed.
-        bit_rate_bps: stored bit rate, bit/s, or None.
-        store: function that stores the pending node-ID and bit rate (bit/s or None), or raises OSError; None
+        node_id: Persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
+        bit_rates_bps: Supported bit rates, bit/s; empty if the bit rate cannot be changed.
+        bit_rate_bps: Stored bit rate, bit/s, or None.
+        store: Function that stores the pending node-ID and bit rate (bit/s or None), or raises OSError; None
             if the node has no memory.
-        activate: function that starts a bit rate change, given the pending bit rate (bit/s or None) and the
+        activate: Function that starts a bit rate change, given the pending bit rate (bit/s or None) and the
             delay in ms; None if the bit rate cannot be changed. See :meth:`on_request`.
     """
 
@@ -79,7 +79,7 @@ class LssSlave:
         """Node-ID that becomes active at the next *reset communication*."""
         self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
-        """Bit rate for the next *activate bit timing*, bit/s; None to keep the current bit rate."""
+        """Bit rate in bit/s for the next *activate bit timing*; None to keep the current bit rate."""
         self._next_question = 0
         self._scan_part = 0
 
@@ -110,16 +110,16 @@ class LssSlave:
         self._scan_part = 0
 
     def on_request(self, data: bytes) -> bytes | None:
-        """Handle a request of the LSS master.
+        """Handle a request from the LSS master.
 
         CiA 305 requires a slave to ignore frames that are not 8 bytes long, unknown commands, and requests
-        that are not allowed in its current state, which may be intended for other slaves.
+        that are not allowed in its current state, because these may be intended for other slaves.
 
-        After *activate bit timing*, the node is silent for twice the delay in the request. It changes its bit
-        rate halfway. In the second half, the other nodes have time to change their bit rates.
+        After *activate bit timing*, the node is silent for twice the delay in the request and changes its bit
+        rate halfway through. The second half gives the other nodes time to change their bit rates.
 
         Args:
-            data: payload of the frame.
+            data: Payload of the frame.
 
         Returns:
             The response, or None if there is none.
@@ -155,7 +155,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Return whether the LSS address matches this request and the preceding ones of its sequence."""
+        """Return whether the LSS address matches this request and the preceding requests in its sequence."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -175,7 +175,7 @@ class LssSlave:
             if (self._address[part] ^ value) >> bit:
                 return None
             self._scan_part = next_part
-            # The whole address matches: the master has found this slave.
+            # The entire address matches: the master has found this slave.
             if bit == 0 and next_part < part:
                 self._enter(LssState.CONFIGURATION)
         return _frame(LssCommand.IDENTIFIED)
@@ -218,10 +218,10 @@ class LssSlave:
 
 
 class BitRateChange:
-    """Bit rate change after *activate bit timing*, with a delay before and after the change.
+    """Performs the bit rate change for *activate bit timing*, with a delay before and after the change.
 
     Args:
-        set_bit_rate: function that changes the bit rate (bit/s), or None if it cannot be changed.
+        set_bit_rate: Function that changes the bit rate (bit/s), or None if it cannot be changed.
     """
 
     def __init__(self, set_bit_rate: Callable[[int], None] | None) -> None:
@@ -235,9 +235,9 @@ class BitRateChange:
         """Start a bit rate change.
 
         Args:
-            bit_rate_bps: new bit rate, bit/s; None to keep the current bit rate.
-            delay_ms: delay in the request, ms.
-            t_ns: arrival time of the request, ns.
+            bit_rate_bps: New bit rate, bit/s; None to keep the current bit rate.
+            delay_ms: Delay in the request, ms.
+            t_ns: Arrival time of the request, ns.
         """
         self._bit_rate_bps = bit_rate_bps
         self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000
@@ -256,7 +256,7 @@ class BitRateChange:
         return self.deadline_ns != NO_DEADLINE_NS
 
     def cancel(self) -> None:
-        """Cancel the bit rate change when the node is switched off."""
+        """Cancel the bit rate change because the node is being switched off."""
         self.deadline_ns = NO_DEADLINE_NS
 
 

@@ -1,4 +1,4 @@
-"""Non-volatile memory of a node in a JSON file with a checksum, which is replaced atomically."""
+"""Stores a node's non-volatile memory in a JSON file that has a checksum and is replaced atomically."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum accepted size of a memory file, bytes; over ten times the size of the largest valid file."""
+"""Maximum accepted size of a memory file in bytes; more than ten times the size of the largest valid file."""
 
 
 class FileMemory:
     """Non-volatile memory of a node in a JSON file.
 
-    **Locking.** :meth:`claim` or the first :meth:`save` locks the file for exclusive access, until
+    **Locking.** :meth:`claim` or the first :meth:`save` locks the file for exclusive access until
     :meth:`close` is called, a ``with`` block ends or the object is deleted. The lock is a kernel lock on a
     separate file in the same folder, which the kernel releases even if the process is killed.
 
-    **Saving** writes a temporary file, flushes it to the disk and renames it to the memory file. If the power
-    fails or the process is killed, the memory file has either its old or its new content. Saving takes a few
+    **Saving** writes a temporary file, flushes it to disk and renames it to the memory file. If the power
+    fails or the process is killed, the memory file has either its old or its new contents. Saving takes a few
     milliseconds, during which all nodes on the same thread are blocked.
 
     Only the owner can read the file (mode 0600). A symbolic link is rejected. A file that is damaged or
-    belongs to another patch is not overwritten, but renamed: ``.unused-`` and a digest of its content are
+    belongs to another patch is not overwritten but renamed: ``.unused-`` and a digest of its contents are
     appended to its name.
 
     Args:
-        path: path of the file; its folder must exist.
+        path: Path of the file; its folder must exist.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -52,8 +52,8 @@ class FileMemory:
         """Lock the file for exclusive access.
 
         Raises:
-            FileInUse: if this process or another process has locked the file.
-            OSError: if the file cannot be locked.
+            FileInUse: If this process or another process has locked the file.
+            OSError: If the file cannot be locked.
         """
         if self._release is None:
             lock = lock_file(self.path.with_name(f".{self.path.name[:200]}.lock"))
@@ -74,10 +74,10 @@ class FileMemory:
         self.close()
 
     def load(self) -> Kept | None:
-        """Return the content, or None if the file does not exist.
+        """Return the contents, or None if the file does not exist.
 
         Raises:
-            MemoryFault: if the file cannot be read, or its content is not usable.
+            MemoryFault: If the file cannot be read, or its contents are not usable.
         """
         try:
             return unpack(self._read())
@@ -89,14 +89,14 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content, and return once the new content is on the disk.
+        """Replace the contents, and return once the new contents are on disk.
 
         Args:
-            kept: new content.
+            kept: New contents.
 
         Raises:
-            FileInUse: if this process or another process has locked the file.
-            OSError: if the file cannot be written. It keeps its old content.
+            FileInUse: If this process or another process has locked the file.
+            OSError: If the file cannot be written. The file keeps its old contents.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -109,7 +109,7 @@ class FileMemory:
         flush_folder(self.path.parent)
 
     def _read(self) -> bytes:
-        # O_NONBLOCK: opening a named pipe would block otherwise.
+        # O_NONBLOCK: otherwise, opening a named pipe would block.
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             descriptor = os.open(self.path, flags)
@@ -137,7 +137,7 @@ class FileMemory:
 
 
 def pack(kept: Kept) -> bytes:
-    """Return the bytes of a memory file with the given content."""
+    """Return the bytes of a memory file with the given contents."""
     content = {
         "patch": kept.patch,
         "node_id": kept.node_id,
@@ -151,13 +151,13 @@ def pack(kept: Kept) -> bytes:
 
 
 def unpack(data: bytes) -> Kept:
-    """Return the content of a memory file.
+    """Return the contents of a memory file.
 
     Args:
-        data: bytes of the file.
+        data: Bytes of the file.
 
     Raises:
-        MemoryFault: if the file is damaged or has a different format.
+        MemoryFault: If the file is damaged or has a different format.
     """
     try:
         document = json.loads(data)

@@ -14,9 +14,9 @@ class NmtSlave:
     """NMT state machine of a node.
 
     Args:
-        store: object dictionary.
-        rejected: counters of rejected frames.
-        entered: callback for a state change; receives the new state, the previous state and the time in ns.
+        store: Object dictionary.
+        rejected: Counters of rejected frames.
+        entered: Callback for a state change; receives the new state, the previous state and the time in ns.
     """
 
     def __init__(
@@ -33,8 +33,8 @@ class NmtSlave:
         """Return the NMT command in a frame, or None if it is malformed or addresses another node.
 
         Args:
-            data: payload of the frame.
-            node_id: node-ID of this node.
+            data: Payload of the frame.
+            node_id: Node-ID of this node.
         """
         try:
             return parse(data, node_id)
@@ -55,8 +55,8 @@ class NmtSlave:
     def on_communication_error(self, t_ns: int) -> None:
         """Apply the error behaviour (0x1029) after a heartbeat event, a life guarding event or bus-off.
 
-        Depending on 0x1029:1, the node leaves OPERATIONAL for PRE-OPERATIONAL (0), keeps its state (1) or
-        enters STOPPED (2).
+        Depending on 0x1029:1, the node changes from OPERATIONAL to PRE-OPERATIONAL (0), keeps its state (1)
+        or enters STOPPED (2).
         """
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:

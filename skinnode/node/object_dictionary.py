@@ -21,12 +21,12 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Maximum length of a value with a variable-length data type, bytes."""
+"""Maximum length in bytes of a value with a variable-length data type."""
 
 Reader = Callable[[int], bytes]
-"""Callback that returns the bytes of a sub-index, or raises Refused."""
+"""Callback that returns the bytes of a sub-index or raises Refused."""
 Guard = Callable[[int, int], None]
-"""Callback that checks a new value, and raises Refused to reject it. Its arguments are the sub-index and the
+"""Callback that checks a new value and raises Refused to reject it. Its arguments are the sub-index and the
 value as an unsigned integer; a REAL32 is passed as its bit pattern."""
 Watcher = Callable[[int], None]
 """Callback for a write by a client. Its argument is the sub-index."""
@@ -37,28 +37,28 @@ DomainWriter = Callable[[bytes], None]
 
 
 class Lengths(NamedTuple):
-    """Range of lengths that a client may write to an object."""
+    """Permitted lengths of the values that a client writes to an object."""
 
     least: int
-    """Minimum length, bytes."""
+    """Minimum length in bytes."""
     most: int
-    """Maximum length, bytes."""
+    """Maximum length in bytes."""
 
     def check(self, length: int) -> None:
         """Check the length of a complete value.
 
         Raises:
-            Refused: if the length is out of range.
+            Refused: If the length is out of range.
         """
         self.check_not_above(length)
         if length < self.least:
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check the length of a value of which more may follow.
+        """Check the length received so far of a value that may be incomplete.
 
         Raises:
-            Refused: if the length exceeds the maximum.
+            Refused: If the length exceeds the maximum.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
@@ -68,12 +68,12 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
     """Convert a value to the bytes that are sent on the bus.
 
     Args:
-        entry: declaration of the object.
-        value: value; bytes are returned unchanged.
+        entry: Declaration of the object.
+        value: Value; bytes are returned unchanged.
 
     Raises:
-        OverflowError: if the value does not fit into the integer type.
-        struct.error: if the value is not a number but the data type is REAL32.
+        OverflowError: If the value does not fit in the integer type.
+        struct.error: If the value is not a number but the data type is REAL32.
     """
     if isinstance(value, bytes):
         return value
@@ -91,8 +91,8 @@ class ObjectStore:
     node itself uses :meth:`raw`, :meth:`integer` and :meth:`put`, which require that the object exists.
 
     Args:
-        objects: declarations of all objects.
-        node_id: node-ID added to the default COB-IDs.
+        objects: Declarations of all objects.
+        node_id: Node-ID added to the default COB-IDs.
     """
 
     def __init__(self, objects: Iterable[Object], node_id: int) -> None:
@@ -115,9 +115,9 @@ class ObjectStore:
         """Register ``reader`` to compute the values of an object.
 
         Args:
-            index: index of the object.
-            reader: returns the bytes of a sub-index.
-            count: whether ``reader`` also computes sub-index 0 of an array or record.
+            index: Index of the object.
+            reader: Returns the bytes of a sub-index.
+            count: Whether ``reader`` also computes sub-index 0 of an array or record.
         """
         whole = count or (index, 1) not in self._entries
         for key in self._entries:
@@ -128,16 +128,16 @@ class ObjectStore:
         """Register functions that read and write a DOMAIN.
 
         Args:
-            index: index of the object.
-            length: length of the value, bytes.
-            reader: returns the value.
-            writer: stores the value.
+            index: Index of the object.
+            length: Length of the value, bytes.
+            reader: Returns the value.
+            writer: Stores the value.
         """
         self._readers[index, 0] = reader
         self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
-        """Register ``guard`` to check each value that a client writes to ``index``, before it is stored."""
+        """Register ``guard`` to check each value that a client writes to ``index`` before it is stored."""
         self._guards[index] = guard
 
     def watch(self, index: int, watcher: Watcher) -> None:
@@ -145,14 +145,14 @@ class ObjectStore:
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Register ``watcher`` to be called when a client has changed an object that is not computed."""
+        """Register ``watcher`` to be called after a client changes an object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
         """Return the declaration of an object.
 
         Raises:
-            Refused: if the index or sub-index does not exist.
+            Refused: If the index or sub-index does not exist.
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
@@ -164,10 +164,10 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the range of lengths that a client may write to an object.
+        """Return the permitted lengths of the values that a client writes to an object.
 
         Raises:
-            Refused: if the object does not exist or is read-only.
+            Refused: If the object does not exist or is read-only.
         """
         entry = self.find(index, subindex)
         if entry.access in ("ro", "const"):
@@ -181,7 +181,7 @@ class ObjectStore:
         """Read an object for a client.
 
         Raises:
-            Refused: if the object does not exist or is write-only.
+            Refused: If the object does not exist or is write-only.
         """
         if self.find(index, subindex).access == "wo":
             raise Refused(AbortCode.WRITE_ONLY)
@@ -191,7 +191,7 @@ class ObjectStore:
         """Write an object for a client: check and store the value, then call the watcher.
 
         Raises:
-            Refused: if the object cannot be written or does not accept the value.
+            Refused: If the object cannot be written or rejects the value.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
@@ -222,7 +222,7 @@ class ObjectStore:
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the stored bytes of an object, even if reads return a computed value."""
+        """Return the stored bytes of an object, even if reading it returns a computed value."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:

@@ -15,26 +15,26 @@ class Rejected(IntEnum):
     """Type of rejected frame. The value is the sub-index of its counter in 0x2040."""
 
     NMT = 1
-    """NMT frame that is not two bytes long, or that sends this node an unknown command."""
+    """NMT frame that is not two bytes long or contains an unknown command for this node."""
     SYNC = 2
     """SYNC whose length does not match 0x1019."""
     TIME = 3
     """TIME message that is not six bytes long or contains an invalid time of day."""
     HEARTBEAT = 4
-    """Heartbeat that is not one byte long, from a monitored node."""
+    """Heartbeat that comes from a monitored node and is not one byte long."""
     SDO = 5
     """SDO request that is not eight bytes long."""
     RPDO = 6
     """RPDO that is shorter than its mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """Boot-up message or heartbeat of another node with the same node-ID."""
+    """Boot-up message or heartbeat from another node with the same node-ID."""
 
 
 class RejectedFrames:
     """Counters of rejected frames (0x2040). They stop at their maximum; *reset node* clears them.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
     """
 
     def __init__(self, store: ObjectStore) -> None:

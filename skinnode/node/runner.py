@@ -1,4 +1,4 @@
-"""Runs nodes that share a CAN port, in one thread."""
+"""Runs nodes that share a CAN port in one thread."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Maximum time (s) to wait for a frame before the thread checks whether it has to stop."""
+"""Maximum time (s) for which the thread waits for a frame before it checks whether it must stop."""
 
 _RETRY_S: Final = 0.02
-"""Pause after a bus error, s; long enough for a full transmit queue to drain."""
+"""Pause (s) after a bus error; long enough for a full transmit queue to drain."""
 
 _CATCH_UP_FRAMES: Final = 4096
 """Maximum number of queued frames to handle before a heartbeat is reported as missed. A fully loaded 1 Mbit/s
-bus carries this number of frames in half a second."""
+bus carries this many frames in half a second."""
 
 OFF_AFTER_S: Final = 0.1
 """Duration (s) of continuous bus errors after which the nodes assume that their CAN controller is bus-off. A
-full transmit queue drains sooner."""
+full transmit queue drains in less time."""
 
 REOPEN_S: Final = 1.0
 """Duration (s) of continuous bus errors after which the CAN interface is reopened. This recovers an interface
@@ -36,17 +36,17 @@ that was unplugged and plugged in again."""
 
 
 class NodeRunner:
-    """Runs a group of nodes from :meth:`start` to :meth:`stop`. It can be started only once.
+    """Runs a group of nodes from :meth:`start` until :meth:`stop`. A runner can be started only once.
 
     Bus errors do not stop the runner. While it runs, other threads may only read the counters of its nodes.
-    All timers have the precision of the most demanding node. The caller has to close the port.
+    All timers have the precision of the most demanding node. The caller must close the port.
 
     Args:
         port: CAN port that the nodes share.
-        nodes: nodes to run.
+        nodes: Nodes to run.
 
     Raises:
-        ValueError: if there are no nodes, or if two nodes have the same node-ID.
+        ValueError: If there are no nodes or two nodes have the same node-ID.
     """
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
@@ -67,7 +67,7 @@ class NodeRunner:
         self._deadlines_ns = [NO_DEADLINE_NS] * len(self.nodes)  # at the end of the last turn
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        # Number of frames that the port had sent when bus-off began. Any further frame proves recovery.
+        # Number of frames that the port had sent when bus-off began. Any frame sent later proves recovery.
         self._sent_before = 0
         self._powered, self._stopping = clock.event(), clock.event()
         self._stopped = False
@@ -80,7 +80,7 @@ class NodeRunner:
         return self._error is not None
 
     def start(self) -> None:
-        """Start the thread, and return when all nodes have been powered on.
+        """Start the thread and return once all nodes have been powered on.
 
         :meth:`stop` raises any error that ends the thread.
         """
@@ -88,14 +88,14 @@ class NodeRunner:
         self._powered.wait()
 
     def request_stop(self) -> None:
-        """Let the thread end within 0.1 s, without waiting for it. Call :meth:`stop` afterwards."""
+        """Request that the thread end within 0.1 s, without waiting for it. Call :meth:`stop` afterwards."""
         self._stopping.set()
 
     def stop(self) -> None:
         """Power the nodes off and end the thread. Repeated calls have no effect.
 
         Raises:
-            BaseException: the error that has ended the thread, if any.
+            BaseException: The error that ended the thread, if any.
         """
         if self._stopped:
             return
@@ -141,7 +141,7 @@ class NodeRunner:
             try:
                 self._turn()
             except BusError as error:
-                # The frame is lost and the nodes continue, as on a board.
+                # The frame is lost and the nodes continue, as they would on a board.
                 self.bus_errors += 1
                 now_s = clock.monotonic()
                 if failing_since_s is None:
@@ -155,7 +155,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            # Only a frame sent or received proves that the bus works.
+            # Only sending or receiving a frame proves that the bus works.
             if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
@@ -174,7 +174,7 @@ class NodeRunner:
             state = bus_state(frame)
             if state is not None:
                 self._set_bus_state(state)
-                self._sent_before = 1 << 63  # a frame counted as sent may only be queued
+                self._sent_before = 1 << 63  # a frame that is counted as sent may still be queued
 
     def _turn(self) -> None:
         """Handle the timers that are due, then wait for a frame or the next timer."""
@@ -184,8 +184,8 @@ class NodeRunner:
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
         for number, node in enumerate(nodes):
-            # A frame may have postponed the deadline since the last turn. The call of on_timer() then has no
-            # effect, and takes less time than asking for the deadline again in every other case.
+            # A frame may have postponed the deadline since the last turn. The call to on_timer() then has no
+            # effect, which costs less than querying every deadline again.
             deadline_ns = self._deadlines_ns[number]
             if deadline_ns > now_ns:
                 deadline_ns = _deadline_ns(node)

@@ -27,4 +27,4 @@ class NodeServices:
     send: Send
     """Function that sends a frame."""
     now: Clock
-    """Function that returns the time of the event being handled, ns."""
+    """Function that returns the time (ns) of the event being handled."""

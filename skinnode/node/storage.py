@@ -1,6 +1,6 @@
 """Storage of the parameters, the baseline and the LSS configuration of a node.
 
-This module implements the objects 0x1010 (store parameters), 0x1011 (restore default parameters) and 0x1020
+This module implements objects 0x1010 (store parameters), 0x1011 (restore default parameters) and 0x1020
 (verify configuration) of CiA 301 v4.2. A *parameter* is an object that a client can write and read back.
 Commands and computed objects are not parameters.
 """
@@ -26,7 +26,7 @@ APPLICATION: Final = 0x2000, 0x9FFF
 EVERYTHING: Final = 0x1000, 0x9FFF
 """First and last index of all parameters."""
 _ALL, _COMMUNICATION_ONLY, _APPLICATION_ONLY = 1, 2, 3
-"""Sub-indices of 0x1010 and 0x1011, which select all, communication or application parameters."""
+"""Sub-indices of 0x1010 and 0x1011 that select all, communication or application parameters."""
 
 _CAN_ID_MASK: Final = 0x7FF
 
@@ -36,14 +36,14 @@ Rows = tuple[tuple[float, ...], ...]
 class Storage:
     """Saves and restores the non-volatile values of a node.
 
-    If this fails, the node sends EMCY 0x6300, whose first manufacturer-specific byte is a
+    If saving or restoring fails, the node sends EMCY 0x6300, whose first manufacturer-specific byte is a
     :class:`~skinnode.node.memory.Fault`.
 
     Args:
-        services: resources that all services of the node share.
-        memory: memory of the node, or None. Without a memory, 0x1010 and 0x1011 read as 0 and refuse writes
+        services: Resources that all services of the node share.
+        memory: Memory of the node, or None. Without a memory, 0x1010 and 0x1011 read as 0 and refuse writes
             (CiA 301).
-        patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
+        patch: Sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """
 
     def __init__(self, services: NodeServices, memory: Memory | None, patch: str) -> None:
@@ -55,7 +55,7 @@ class Storage:
         self.problem = ""
         """One-line description of the latest memory problem; empty if there has been none."""
         self.baseline_ohm: Callable[[], Rows] = tuple
-        """Function that returns the baseline R0, ohm. Set by the application."""
+        """Function that returns the baseline R0 in ohms. Set by the application."""
         # 1 means that the node saves or restores parameters on command.
         able = int(memory is not None).to_bytes(4, "little")
         for index, signature, command in (
@@ -88,7 +88,7 @@ class Storage:
         if kept is not None and kept.patch != patch:
             self.note(
                 Fault.FOREIGN,
-                why=f"the content belongs to the patch {kept.patch!r}, but this patch is {patch!r}",
+                why=f"the contents belong to the patch {kept.patch!r}, but this patch is {patch!r}",
             )
         elif kept is not None:
             self._kept = kept
@@ -97,10 +97,10 @@ class Storage:
         """Record a fault for :meth:`report`.
 
         Args:
-            fault: type of the fault.
-            index: index of the refused parameter, if any.
-            subindex: sub-index of the refused parameter, if any.
-            why: one-line description; by default, a description of the refused parameter.
+            fault: Type of the fault.
+            index: Index of the refused parameter, if any.
+            subindex: Sub-index of the refused parameter, if any.
+            why: One-line description; by default, a description of the refused parameter.
         """
         self.problem = why or f"the stored value of 0x{index:04X}:{subindex} is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
@@ -141,7 +141,7 @@ class Storage:
             self._clear_verification()  # this is not the configuration that was verified
 
     def keep_baseline(self) -> None:
-        """Save the baseline, if the node has a memory."""
+        """Save the baseline if the node has a memory."""
         if self._memory is None:
             return
         try:
@@ -154,10 +154,10 @@ class Storage:
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
-            bit_rate_bps: bit rate, bit/s; None if LSS has not configured one.
+            bit_rate_bps: Bit rate, bit/s; None if LSS has not configured one.
 
         Raises:
-            OSError: if saving fails.
+            OSError: If saving fails.
         """
         self._keep(replace(self._kept, node_id=node_id, bit_rate_bps=bit_rate_bps))
 
@@ -168,7 +168,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """End the given faults, and report their end."""
+        """End the given faults and report their end."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -183,8 +183,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # With this command, the user accepts the current parameters, so faults of the memory's content
-            # end. Saving the baseline automatically does not end them.
+            # With this command, the user accepts the current parameters, so any faults in the memory's
+            # contents end. Saving the baseline automatically does not end them.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -197,7 +197,8 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # 0x1020 identifies a whole configuration, so it is saved only together with one.
+        # 0x1020 identifies a complete configuration, so it is saved only together with a complete
+        # configuration.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 

@@ -1,4 +1,4 @@
-"""SYNC consumer and producer (CiA 301 v4.2, 7.2.5), with the objects 0x1005, 0x1006, 0x1007 and 0x1019."""
+"""SYNC consumer and producer (CiA 301 v4.2, 7.2.5), including objects 0x1005, 0x1006, 0x1007 and 0x1019."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ PRODUCER_BIT: Final = 1 << 30
 """Bit in 0x1005 that enables SYNC production."""
 
 SHORTEST_PERIOD_US: Final = 100
-"""Minimum communication cycle period (0x1006), µs; twice the duration of a SYNC at 1 Mbit/s."""
+"""Minimum communication cycle period (0x1006) in µs; twice the duration of a SYNC at 1 Mbit/s."""
 
 _DO_NOT_CARE_BIT: Final = 1 << 31
-"""Bit in 0x1005 that may be set but has no effect (CiA 301 v4.2, table 44)."""
+"""Bit in 0x1005 that can be set but has no effect (CiA 301 v4.2, table 44)."""
 
 
 class SyncWindow:
@@ -33,29 +33,29 @@ class SyncWindow:
         self._missed: set[int] = set()
 
     def start(self, t_ns: int) -> None:
-        """Open the window at a SYNC."""
+        """Open the window on a SYNC."""
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Forget the last SYNC and end all errors, because the NMT state has changed."""
+        """Forget the last SYNC and end all errors because the NMT state has changed."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
 
     def is_open(self, t_ns: int) -> bool:
-        """Return whether synchronous PDOs are valid at ``t_ns``. Before the first SYNC, they always are."""
+        """Return whether synchronous PDOs are valid at ``t_ns``; always true before the first SYNC."""
         length_us = self._store.integer(od.SYNC_WINDOW)
         return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
 
     def lets_out(self, number: int, t_ns: int) -> bool:
         """Return whether a synchronous TPDO may be sent. If not, the caller must discard it.
 
-        A discarded TPDO is reported in an emergency message. The error ends when the same TPDO is sent within
-        the window again.
+        A discarded TPDO is reported in an emergency message. The error ends when the same TPDO is next sent
+        within the window.
 
         Args:
-            number: number of the TPDO, counted from 0.
-            t_ns: current time, ns.
+            number: Number of the TPDO, counted from 0.
+            t_ns: Current time, ns.
         """
         if self.is_open(t_ns):
             self._clear(number, t_ns)
@@ -77,7 +77,7 @@ class Sync:
     like one accepted by :meth:`accept`.
 
     Args:
-        services: resources that all services of the node share.
+        services: Resources that all services of the node share.
     """
 
     def __init__(self, services: NodeServices) -> None:
@@ -118,8 +118,8 @@ class Sync:
     def enter(self, *, communicates: bool) -> None:
         """Handle a change in the NMT state.
 
-        SYNCs are produced and consumed in PRE-OPERATIONAL and OPERATIONAL. When the node enters one of these
-        states from any other state, the SYNC counter restarts at 1.
+        SYNCs are produced and consumed in PRE-OPERATIONAL and OPERATIONAL. When the node enters either state
+        from any other state, the SYNC counter restarts at 1.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -135,7 +135,7 @@ class Sync:
     def on_timer(self, t_ns: int) -> bytes | None:
         """Send a SYNC and return its payload, or return None if no SYNC is due.
 
-        SYNCs that are overdue by a whole period are skipped. The phase of the schedule does not change.
+        SYNCs that are overdue by a full period are skipped. The phase of the schedule does not change.
         """
         if t_ns < self.deadline_ns:
             return None
@@ -153,8 +153,8 @@ class Sync:
         A wrong length is reported in an emergency message, but not again while it stays the same.
 
         Args:
-            message: payload of the SYNC.
-            t_ns: arrival time, ns.
+            message: Payload of the SYNC.
+            t_ns: Arrival time, ns.
         """
         counted = self._overflow > 0
         if len(message) == counted:

@@ -1,8 +1,8 @@
-"""TIME consumer (CiA 301 v4.2, 7.2.6), with the object 0x1012.
+"""TIME consumer (CiA 301 v4.2, 7.2.6), including object 0x1012.
 
-A node has no real-time clock. It stores the last time of day received and the time at which it arrived on the
-node's own clock, and computes the current time of day (0x2022) from both. A host can use 0x2022 to convert
-the device times of scans to dates.
+A node has no real-time clock. It stores the last time of day received and its arrival time on the node's own
+clock, and computes the current time of day (0x2022) from both. A host can use 0x2022 to convert the device
+times of scans to dates.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class TimeConsumer:
     """TIME consumer of a node. The object 0x2022 contains the current time of day.
 
     Args:
-        store: object dictionary.
-        now: function that returns the time of the event being handled, ns.
+        store: Object dictionary.
+        now: Function that returns the time (ns) of the event being handled.
     """
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
@@ -52,8 +52,8 @@ class TimeConsumer:
         """Process a TIME message.
 
         Args:
-            data: payload of the frame.
-            t_ns: arrival time, ns.
+            data: Payload of the frame.
+            t_ns: Arrival time, ns.
 
         Returns:
             Whether the payload is a valid time of day. An invalid payload is ignored.

@@ -13,7 +13,7 @@ class Timers:
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
-        self._heap: list[tuple[int, int]] = []  # may contain entries of timers that were changed or cancelled
+        self._heap: list[tuple[int, int]] = []  # may contain entries for changed or cancelled timers
 
     @property
     def deadline_ns(self) -> int:
@@ -27,8 +27,8 @@ class Timers:
         """Set, change or cancel a timer.
 
         Args:
-            key: number of the timer.
-            t_ns: time at which the timer is due, ns; NO_DEADLINE_NS to cancel it.
+            key: Number of the timer.
+            t_ns: Time at which the timer is due, ns; NO_DEADLINE_NS to cancel it.
         """
         if t_ns == NO_DEADLINE_NS:
             self._due.pop(key, None)

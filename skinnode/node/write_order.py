@@ -14,10 +14,10 @@ Key = tuple[int, int]
 
 _PDO_END: Final = 0x1C00
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
-"""Objects that must be written last, in this order.
+"""Objects that must be written last, in the given order.
 
-A cycle period locks the SYNC counter overflow. The COB-ID of SYNC starts the SYNC producer, which needs the
-cycle period. Any write clears 0x1020.
+Setting a cycle period locks the SYNC counter overflow. Writing the SYNC COB-ID starts the SYNC producer,
+which needs the cycle period. Any write clears 0x1020.
 """
 
 
@@ -27,12 +27,12 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
     PDOs are disabled while their parameters are written, and EMCY is disabled before its COB-ID is written.
 
     Args:
-        store: object dictionary.
-        values: saved bytes, by index and sub-index.
+        store: Object dictionary.
+        values: Saved bytes, by index and sub-index.
 
     Returns:
-        Objects that refused their values and keep their defaults. A mapping with a refused entry keeps its
-        default as a whole.
+        Objects that refused their values and keep their defaults. A mapping that has a refused entry keeps
+        its entire default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
@@ -55,7 +55,7 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
 
 
 def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
-    """Write both records of a PDO, and yield the objects that refused their values.
+    """Write both records of a PDO and yield the objects that refused their values.
 
     ``pdo`` is the index of the communication record. ``default`` is the COB-ID if ``values`` contains none.
     """

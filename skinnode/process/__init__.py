@@ -1,1 +1,1 @@
-"""Process-wide facilities: clock, signals, child processes, garbage collection, closing of resources."""
+"""Process-wide facilities: clock, signals, child processes, garbage collection and resource closing."""

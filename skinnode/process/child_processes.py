@@ -1,9 +1,9 @@
-"""Starts child processes that do not receive the signals of the terminal.
+"""Starts child processes that do not receive signals from the terminal.
 
 A terminal sends SIGINT (Ctrl-C) and SIGHUP to a command and to all of its child processes. SIGINT would make
-a child print a traceback if it is still importing modules, and SIGHUP would kill the resource tracker of
-``multiprocessing`` before its clean-up. Child processes therefore run with both signals blocked, and the
-command ends them itself.
+a child print a traceback if it is still importing modules, and SIGHUP would kill the ``multiprocessing``
+resource tracker before it has cleaned up. Child processes therefore run with both signals blocked, and the
+command terminates them itself.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 
 @contextmanager
 def starting_children() -> Iterator[None]:
-    """Block the signals of the terminal for all child processes started in this ``with`` block.
+    """Block signals from the terminal for all child processes started in this ``with`` block.
 
     In this process, a signal that arrives during the block is handled at the end of the block.
     """
@@ -37,11 +37,11 @@ def starting_children() -> Iterator[None]:
 
 @contextmanager
 def _signals_deferred() -> Iterator[None]:
-    """Defer the handling of signals to the end of the ``with`` block.
+    """Defer signal handling to the end of the ``with`` block.
 
-    To block signals in the main thread would not be sufficient: another thread can receive the signal, and
-    Python then calls its handler on the main thread. On other threads, this function does nothing, because
-    Python never handles signals there.
+    Blocking signals in the main thread would not be sufficient: another thread could receive the signal, and
+    Python would then call its handler on the main thread. On other threads, this function does nothing,
+    because Python never handles signals there.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

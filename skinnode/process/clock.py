@@ -1,4 +1,4 @@
-"""Time, waiting and threads, on the system clock or on a virtual clock.
+"""Provides time, waiting and threads on the system clock or on a virtual clock.
 
 All code that reads the time, waits or starts threads must use this module, so that it can run in virtual
 time. :func:`use` sets the clock of the current thread, and a new thread inherits the clock of the thread that
@@ -20,10 +20,10 @@ class Clock(Protocol):
     """Source of time, threads and synchronisation objects."""
 
     def monotonic_ns(self) -> int:
-        """Return the monotonic time, ns."""
+        """Return the monotonic time in ns."""
 
     def time_ns(self) -> int:
-        """Return the Unix time, ns."""
+        """Return the Unix time in ns."""
 
     def sleep(self, seconds: float, /) -> None:
         """Suspend the current thread for ``seconds``."""
@@ -82,7 +82,7 @@ _here = _Here()
 
 @contextmanager
 def use(clock: Clock) -> Iterator[None]:
-    """Use ``clock`` on the current thread, and on threads that it creates, during the ``with`` block."""
+    """Use ``clock`` on the current thread, and on the threads it creates, during the ``with`` block."""
     before, _here.clock = _here.clock, clock
     try:
         yield
@@ -96,28 +96,28 @@ def current() -> Clock:
 
 
 def monotonic_ns() -> int:
-    """Return the monotonic time, ns."""
+    """Return the monotonic time in ns."""
     return _here.clock.monotonic_ns()
 
 
 def monotonic() -> float:
-    """Return the monotonic time, s."""
+    """Return the monotonic time in seconds."""
     return _here.clock.monotonic_ns() * 1e-9
 
 
 def perf_counter() -> float:
-    """Return the performance counter, s. A virtual clock does not advance during computations."""
+    """Return the performance counter in seconds. A virtual clock does not advance during computations."""
     clock = _here.clock
     return system_time.perf_counter() if clock is _SYSTEM else clock.monotonic_ns() * 1e-9
 
 
 def time_ns() -> int:
-    """Return the Unix time, ns."""
+    """Return the Unix time in ns."""
     return _here.clock.time_ns()
 
 
 def time() -> float:
-    """Return the Unix time, s."""
+    """Return the Unix time in seconds."""
     return _here.clock.time_ns() * 1e-9
 
 

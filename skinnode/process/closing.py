@@ -1,4 +1,4 @@
-"""Base class of resources that are closed at the end of a ``with`` block."""
+"""Base class for resources that are closed at the end of a ``with`` block."""
 
 from __future__ import annotations
 

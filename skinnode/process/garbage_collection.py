@@ -13,7 +13,7 @@ def without_long_collections() -> Iterator[None]:
     """Exclude all existing objects from garbage collection during the ``with`` block.
 
     With numba and canopen loaded, a full collection stops all threads for 30 ms on a small computer, during
-    which a node can miss a scan or SYNC can be late. Enter the block when the set-up is complete. Existing
+    which a node can miss a scan or a SYNC can be late. Enter the block once set-up is complete. Existing
     objects that become cyclic garbage during the block are freed after it.
     """
     gc.collect()

@@ -1,4 +1,4 @@
-"""Orderly shutdown of programs that run until a signal stops them."""
+"""Shuts down programs in an orderly way when a signal stops them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from types import FrameType
 class SignalEvent(threading.Event):
     """Event that can be set in a signal handler.
 
-    ``threading.Event`` cannot: if the signal interrupts ``wait`` while it holds the lock of the event,
-    ``set`` blocks forever. This class is based on ``SimpleQueue.put``, which is reentrant.
+    ``threading.Event`` cannot: if the signal interrupts ``wait`` while it holds the event's lock, ``set``
+    blocks forever. This class is based on ``SimpleQueue.put``, which is reentrant.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class SignalEvent(threading.Event):
         self._wake.put(None)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the event is set, for at most ``timeout`` seconds; return whether it is set."""
+        """Wait up to ``timeout`` seconds for the event to be set; return whether it is set."""
         if not self._is_set:
             with suppress(Empty):
                 self._wake.get(timeout=None if timeout is None else max(0.0, timeout))
@@ -44,11 +44,11 @@ class SignalEvent(threading.Event):
 def stop_on_signal() -> Iterator[threading.Event]:
     """Yield an event that is set by SIGINT (Ctrl-C), SIGTERM or SIGHUP (terminal closed).
 
-    SIGHUP stays ignored if it is ignored on entry, as under nohup. The previous signal handlers are restored
+    If SIGHUP is ignored on entry, as under nohup, it stays ignored. The previous signal handlers are restored
     on exit.
 
     Raises:
-        ValueError: The function is not called on the main thread.
+        ValueError: The function was not called on the main thread.
     """
     stop = SignalEvent()
 

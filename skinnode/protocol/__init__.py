@@ -4,6 +4,6 @@ A node encodes resistances (``codes``) and packs the codes into PDOs (``chunk``,
 assembles the PDOs into scans (``assembler``) and decodes the codes. ``profile`` defines the sizes of a patch,
 on which the wire format depends. ``codec`` re-exports the public names of the other modules.
 
-``c_kit`` generates the same in C99, for the firmware of a board and for foreign masters. Its source code is
+``c_kit`` generates a C99 implementation for board firmware and other masters. Its source code is
 in the folder ``c``.
 """

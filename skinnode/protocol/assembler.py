@@ -2,24 +2,24 @@
 
 **Grouping.** A frame belongs to the open scan if it carries the scan's counter and arrives within the
 *timeout* after the scan's first frame. The timeout is three periods, or less if the counter range is short.
-The first frame of a newer scan closes the open scan for good. Because counters repeat, a frame that is a
-whole counter cycle late could be mistaken for a frame of a later scan. This is impossible if every frame
+The first frame of a newer scan permanently closes the open scan. Because counters repeat, a frame that is a
+full counter cycle late could be mistaken for a frame of a later scan. This is impossible if every frame
 arrives less than counter range × period − timeout after its SYNC. With the usual counter range of 240, this
 limit is 237 periods.
 
-**Two scans with the same counter.** Two scans have the same counter if a node fails to increment it, or if
-two nodes share a node-ID. The assembler notices if two different frames arrive for the same chunk or summary.
-It cannot tell which scan the other frames belong to, so it discards all of them. It also discards an
-incomplete scan whose chunks arrived more than two periods apart, because they may belong to two scans. If no
-chunk arrived from both scans, only the scan check can detect the mix.
+**Two scans with the same counter.** This happens if a node fails to increment the counter or two nodes share
+a node-ID. The assembler notices if two different frames arrive for the same chunk or summary. It cannot tell
+which scan the other frames belong to, so it discards all of them. It also discards an incomplete scan whose
+chunks arrived more than two periods apart, because they may belong to two scans. If no chunk arrived from
+both scans, only the scan check can detect the mixture.
 
 **Scan check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes of the patch, including those of unsent chunks (:mod:`skinnode.protocol.scan_check`). A failed check
 does not reveal which chunk is wrong, so the assembler discards the scan and all codes stored for unsent
 chunks. A stream is *checked* once a check has passed, or after :meth:`ScanAssembler.reset` with
 ``checked=True``. In a checked stream, a scan is complete only if its check passed, and a summary without a
-check is rejected. If all chunks of a scan arrived, but the check is impossible, the scan is published as
-*unchecked*. The check is impossible if the summary was lost, or if the codes of unsent chunks are unknown.
+check is rejected. If all chunks of a scan arrived but the check is impossible, the scan is published as
+*unchecked*. The check is impossible if the summary was lost or the codes of unsent chunks are unknown.
 Patches of revision 1.0 send no checks, so their scans are complete once all chunks have arrived.
 
 **Order.** A frame starts a newer scan if its counter is ahead of the last scan's counter by at most half the
@@ -28,7 +28,7 @@ with any counter is accepted, because the node or the SYNC producer may have res
 
 **Unsent chunks.** If the node sends only changed chunks, the other chunks keep their last codes
 (:mod:`skinnode.protocol.partial_scan`). After a lost or incomplete scan, or a pause longer than the timeout,
-the codes of unsent chunks are unknown until the node sends these chunks again.
+the codes of unsent chunks are unknown until the node sends those chunks again.
 """
 
 from __future__ import annotations
@@ -50,36 +50,36 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Placeholder payload for chunk indices beyond the patch's last chunk. An invalid index thus looks like that
-of a repeated chunk, so the range is checked only for repeated chunks."""
+"""Placeholder payload for chunk indices beyond the patch's last chunk. An invalid index thus looks like a
+repeated chunk, so the range is checked only for repeated chunks."""
 _NONE_OPEN: Final = -1  # scan counters are never negative
 _NEVER: Final = -1
-# Plain ints, because testing an enum flag takes as long as processing a chunk.
+# Plain integers, because testing an enum flag takes as long as processing a chunk.
 _CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 class ScanAssembler:
-    """Assembles the scans of one patch. Each call returns at most one scan, and scans are in order.
+    """Assembles the scans of one patch. Each call returns at most one scan; scans are returned in order.
 
-    Call :meth:`poll` after each batch of frames, and at the time given by :meth:`next_deadline_ns`. It
+    Call :meth:`poll` after each batch of frames, and at the time given by :meth:`next_deadline_ns`. ``poll``
     returns scans whose missing frames have timed out. If a frame closes two scans, the call that processes
-    the frame returns the first scan, and ``poll`` returns the second.
+    the frame returns the first scan and ``poll`` returns the second.
 
     Args:
-        profile: sizes of the patch.
-        counter_overflow: synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
+        profile: Sizes of the patch.
+        counter_overflow: Synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
             the patch counts its own scans from 0 to 255.
-        period_ns: scan period, ns. The timeout is a multiple of this period.
-        grace_ns: maximum time (ns) to wait for the remaining frames after the summary, or after all chunks of
-            a full scan, have arrived.
-        node_id: node-ID for the COB-IDs in the errors passed to ``on_reject``.
-        on_reject: callback that receives a CodecError for each frame with a wrong length, and for each
+        period_ns: Scan period, ns. The timeout is a multiple of this period.
+        grace_ns: Maximum time (ns) to wait for the remaining frames once the summary or all chunks of a full
+            scan have arrived.
+        node_id: Node-ID for the COB-IDs in the errors passed to ``on_reject``.
+        on_reject: Callback that receives a CodecError for each frame with a wrong length, and for each
             summary that lacks a required check.
-        under_way: whether the node may already be sending scans; see :meth:`reset`.
+        under_way: Whether the node may already be sending scans; see :meth:`reset`.
 
     Raises:
-        ConfigError: if ``counter_overflow`` is neither 0 nor 2 to 240, or if a time is not positive.
+        ConfigError: If ``counter_overflow`` is neither 0 nor 2 to 240, or a time is not positive.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, each given alone by some caller
@@ -126,7 +126,7 @@ class ScanAssembler:
         self._checked = False
         self._device_time = DeviceTimeTracker()
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
-        self._t_chunk_ns = self._t_summary_ns = 0  # times of reception: last chunk, summary
+        self._t_chunk_ns = self._t_summary_ns = 0  # arrival times: last chunk, summary
 
         self._held = HeldChunks(profile)
         self._follows = False  # whether the open scan follows the last scan without a gap
@@ -144,8 +144,8 @@ class ScanAssembler:
         """Process a chunk.
 
         Args:
-            data: payload of TPDO1. The assembler keeps a reference to this object.
-            t_ns: arrival time, ns.
+            data: Payload of TPDO1. The assembler keeps a reference to this object.
+            t_ns: Arrival time, ns.
 
         Returns:
             The scan that this chunk closed, or None.
@@ -170,8 +170,8 @@ class ScanAssembler:
         """Process a summary.
 
         Args:
-            data: payload of TPDO2.
-            t_ns: arrival time, ns.
+            data: Payload of TPDO2.
+            t_ns: Arrival time, ns.
 
         Returns:
             The scan that this summary closed, or None.
@@ -205,18 +205,18 @@ class ScanAssembler:
         return closed
 
     def poll(self, t_ns: int) -> Scan | None:
-        """Close the open scan if its missing frames have timed out, and return it.
+        """If the missing frames of the open scan have timed out, close the scan and return it.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         deadline = self.next_deadline_ns()
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return the earliest time (ns) at which :meth:`poll` closes the open scan; None if none is open.
+        """Return the earliest time (ns) at which :meth:`poll` closes the open scan; None if no scan is open.
 
-        Each frame that arrives may change this time.
+        Every arriving frame can change this time.
         """
         if self._counter == _NONE_OPEN:
             return None
@@ -227,12 +227,12 @@ class ScanAssembler:
         return self._expires_ns
 
     def reset(self, *, under_way: bool = False, checked: bool = False) -> None:
-        """Discard the open scan, the stored codes and the scan counter, for example after a boot-up.
+        """Discard the open scan, the stored codes and the scan counter, for example after a boot-up message.
 
         Args:
-            under_way: whether the node may already be sending scans. If so, the first scan is discarded if
+            under_way: Whether the node may already be sending scans. If so, the first scan is discarded if
                 its beginning was missed, and its missing chunks are not counted as lost.
-            checked: whether every summary must contain a check. If false, checks become mandatory as soon as
+            checked: Whether every summary must contain a check. If false, checks become mandatory as soon as
                 one has passed.
         """
         if self._counter != _NONE_OPEN:
@@ -367,7 +367,7 @@ class ScanAssembler:
         self._expires_ns = t_ns + self._timeout_ns
 
     def _steps_to(self, counter: int, last: int) -> int:
-        """Return by how many scans ``counter`` is ahead of ``last``, from 1 to the counter range."""
+        """Return how many scans ``counter`` is ahead of ``last``, from 1 to the counter range."""
         return (counter - last) % self._range or self._range
 
     def _book(self) -> None:
@@ -376,7 +376,7 @@ class ScanAssembler:
         self._summaries += self._summary is not None
 
     def _close(self) -> Scan | None:
-        """Close the open scan and return it, or None if it has to be discarded."""
+        """Close the open scan and return it, or return None if it must be discarded."""
         self._book()
         self._counter = _NONE_OPEN
         summary = self._summary
@@ -435,9 +435,9 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard all stored codes after a scan was discarded.
+        """Discard all stored codes because a scan was discarded.
 
-        ``doubt`` is true if that scan may have announced a new baseline.
+        ``doubt`` is true if the scan may have announced a new baseline.
         """
         self._held.forget()
         if doubt and self.on_discarded is not None:

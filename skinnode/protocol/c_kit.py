@@ -1,4 +1,4 @@
-"""Generates the C99 kit, with which board firmware packs scans and foreign masters assemble them.
+"""Generates the C99 kit, which board firmware uses to pack scans and other masters use to assemble them.
 
 The kit has three files. ``skinnode_patch.h`` and ``skinnode_patch.c`` are the same for every patch and are
 kept as C files in the folder ``c``, so that they can be read, checked and compiled directly. All sizes,
@@ -68,11 +68,11 @@ _Macros = dict[str, str | int]
 
 
 def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[str, str]:
-    """Return the content of the kit's files, by file name.
+    """Return the contents of the kit's files, by file name.
 
     Args:
-        profile: sizes of the patch.
-        layout: electrodes of the patch; None if only the sizes are known.
+        profile: Sizes of the patch.
+        layout: Electrodes of the patch; None if only the sizes are known.
     """
     folder = resources.files(__package__) / "c"
     fixed = {name: (folder / name).read_text(encoding="ascii") for name in FIXED_NAMES}
@@ -80,13 +80,13 @@ def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[
 
 
 def may_replace(file: Path) -> bool:
-    """Return whether a kit file may be written: it does not exist yet, or it begins with :data:`MARK`.
+    """Return whether a kit file may be written: it does not exist yet or begins with :data:`MARK`.
 
     Args:
-        file: path of the file.
+        file: Path of the file.
 
     Raises:
-        OSError: if the file exists but cannot be read.
+        OSError: If the file exists but cannot be read.
     """
     if not file.exists():
         return True
@@ -97,11 +97,11 @@ def may_replace(file: Path) -> bool:
 
 
 def config_header(profile: PatchProfile, layout: PatchLayout | None = None) -> str:
-    """Return the content of ``skinnode_patch_config.h``, which depends only on the arguments.
+    """Return the contents of ``skinnode_patch_config.h``, which depends only on the arguments.
 
     Args:
-        profile: sizes of the patch.
-        layout: electrodes of the patch; None if only the sizes are known.
+        profile: Sizes of the patch.
+        layout: Electrodes of the patch; None if only the sizes are known.
     """
     bus = "PDO over CAN FD" if profile.bus == "fd" else "classic CAN"
     sizes = f"{profile.rows} x {profile.columns} wires with {profile.code_bits}-bit codes on {bus}"
@@ -213,7 +213,7 @@ def _values(profile: PatchProfile) -> _Macros:
 
 
 def _layout(layout: PatchLayout) -> str:
-    """Return the layout's macros, and its coordinates for the source file that requests them."""
+    """Return the layout's macros and the coordinates, which only the requesting source file compiles."""
     (resistivity,) = struct.unpack("<I", struct.pack("<f", layout.resistivity_ohm_per_m))
     coordinates = pack_coordinates(layout)
     rows = [coordinates[at : at + _COORDINATE_BYTES] for at in range(0, len(coordinates), _COORDINATE_BYTES)]

@@ -24,7 +24,7 @@ class Chunk(NamedTuple):
     """Contents of a chunk, as sent on a classic CAN bus."""
 
     chunk: int
-    """Chunk index. The first code of the chunk is code ``chunk · codes_per_chunk`` of the scan."""
+    """Chunk index. The chunk begins with code ``chunk · codes_per_chunk`` of the scan."""
     scan: int
     """Scan counter, u8."""
     codes: tuple[int, ...]
@@ -34,13 +34,13 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
     """Pack the payload of TPDO1.
 
     Args:
-        chunk: chunk index, 0 to 255.
-        scan: scan counter, 0 to 255.
-        codes: up to 3 codes of 16 bits, or 2 of 24 bits; unused bytes are set to 0.
-        bits: width of a code, 16 or 24.
+        chunk: Chunk index, 0 to 255.
+        scan: Scan counter, 0 to 255.
+        codes: Up to 3 codes of 16 bits, or 2 of 24 bits; unused bytes are set to 0.
+        bits: Width of a code, 16 or 24.
 
     Raises:
-        ValueError: if a value does not fit into its field, or if there are too many codes.
+        ValueError: If a value does not fit in its field or there are too many codes.
     """
     width = bits // 8
     if not (0 <= chunk <= 255 and 0 <= scan <= 255):
@@ -58,12 +58,12 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
     """Unpack the payload of TPDO1.
 
     Args:
-        data: payload of the frame.
-        bits: width of a code, 16 or 24.
+        data: Payload of the frame.
+        bits: Width of a code, 16 or 24.
         cob_id: COB-ID for the error message.
 
     Raises:
-        CodecError: if the payload is not 8 bytes long.
+        CodecError: If the payload is not 8 bytes long.
     """
     require_length(data, PDO_BYTES, cob_id, "chunk")
     width = bits // 8
@@ -78,12 +78,12 @@ def pack_scan(
 
     Args:
         codes: (U, K) codes.
-        scan: scan counter, 0 to 255.
-        profile: sizes of the patch.
-        only: chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
+        scan: Scan counter, 0 to 255.
+        profile: Sizes of the patch.
+        only: Chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
 
     Raises:
-        ValueError: if the shape is wrong, or if a code to pack has more bits than ``profile`` allows.
+        ValueError: If the shape is wrong or a code to pack has more bits than ``profile`` allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
@@ -111,7 +111,7 @@ def pack_scan(
 
 @functools.cache
 def _empty_chunks(profile: PatchProfile) -> NDArray[np.uint8]:
-    """Return (chunks, bytes) payloads whose scan counter and codes are still zero."""
+    """Return (chunks, bytes) payloads in which the scan counter and the codes are still zero."""
     n = profile.n_chunks
     chunks = np.zeros((n, profile.chunk_bytes), dtype=np.uint8)
     if profile.bus == "classic":
@@ -127,8 +127,8 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
     """Return the (U, K) codes of a scan, given the payloads of its chunks.
 
     Args:
-        frames: payloads of all chunks in ascending order, concatenated.
-        profile: sizes of the patch.
+        frames: Payloads of all chunks in ascending order, concatenated.
+        profile: Sizes of the patch.
     """
     return unpack_scan_with_check(frames, profile)[0]
 
@@ -137,8 +137,8 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
     """Return the codes of a scan and the CRC over them.
 
     Args:
-        frames: payloads of all chunks in ascending order, concatenated.
-        profile: sizes of the patch.
+        frames: Payloads of all chunks in ascending order, concatenated.
+        profile: Sizes of the patch.
 
     Returns:
         (U, K) codes, and the CRC over them (:func:`~skinnode.protocol.scan_check.check_of_codes`).
@@ -171,7 +171,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return, for each of the (U, K) codes, the number of its chunk, counted from 0 in sending order."""
+    """Return the (U, K) chunk numbers of the codes, counted from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -181,7 +181,7 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 
 
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
-    """Return a function that reads the number of a chunk (:func:`chunk_of_code`) from its payload.
+    """Return a function that reads a chunk's number (:func:`chunk_of_code`) from its payload.
 
     The function returns ``n_chunks`` or more if the patch has no such chunk. The length of the payload must
     already have been checked.

@@ -1,9 +1,9 @@
 """Conversion between resistances and the codes sent on the bus.
 
 A resistance R is encoded as the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)), rounded from the exact
-value, with ties to the even code, so that every implementation can compute the same code. Codes from 0 to
-2ⁿ − 4 are measurements. The three codes above are reserved for over-range, short and open, in this order. The
-host decodes live streams with the compiled function ``skinnode.solve.wires.decode``.
+value with ties to the even code, so that every implementation can compute the same code. Codes from 0 to 2ⁿ −
+4 are measurements. The three codes above that range are reserved for over-range, short and open, in that
+order. The host decodes live streams with the compiled function ``skinnode.solve.wires.decode``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MISSING: Final = 0xFFFF_FFFF
 """Placeholder for a code that was not received. It is greater than every code."""
 
 CODE_BITS: Final = (16, 24)
-"""Allowed code widths, bits."""
+"""Allowed code widths in bits."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class CodeScale:
     """Mapping of R/R0 to codes. ``lo`` and ``hi`` are rounded to REAL32, as in the object dictionary.
 
     Raises:
-        ConfigError: if the code width is neither 16 nor 24 bits, or if 0 ≤ lo < hi < ∞ does not hold.
+        ConfigError: If the code width is neither 16 nor 24 bits, or 0 ≤ lo < hi < ∞ does not hold.
     """
 
     bits: int = 16
-    """Width of a code, bits."""
+    """Width of a code in bits."""
     lo: float = DEFAULT_CODE_LO
     """R/R0 of code 0."""
     hi: float = DEFAULT_CODE_HI
@@ -61,7 +61,7 @@ class CodeScale:
 
     @property
     def over_range(self) -> int:
-        """Reserved code for an R/R0 outside the code range, and for a crossing without a baseline."""
+        """Reserved code for an R/R0 value outside the code range and for a crossing without a baseline."""
         return self.steps + 1
 
     @property
@@ -81,7 +81,7 @@ class CodeScale:
 
     @functools.cached_property
     def position_error(self) -> float:
-        """Bound on the rounding error of (R/R0 − lo) / step in double precision, codes.
+        """Bound, in codes, on the rounding error of (R/R0 − lo) / step in double precision.
 
         The errors of R/R0 and of its difference from ``lo`` are relative to ``hi``. The errors of the step
         and of the division are relative to the code. The bound is twice the sum of these four errors.
@@ -98,10 +98,10 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
     """Round R0 to REAL32, its precision in the object dictionary.
 
     Args:
-        baseline_ohm: R0, ohm; any shape.
+        baseline_ohm: R0 in ohms; any shape.
 
     Returns:
-        Rounded R0, ohm, as float64 of the same shape.
+        Rounded R0 in ohms, float64 of the same shape.
     """
     return np.asarray(baseline_ohm, dtype=np.float32).astype(np.float64)
 
@@ -114,9 +114,9 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     and finite.
 
     Args:
-        resistance_ohm: resistances, ohm; any shape.
-        baseline_ohm: R0, ohm; broadcastable to the shape of the resistances.
-        scale: mapping of R/R0 to codes.
+        resistance_ohm: Resistances in ohms; any shape.
+        baseline_ohm: R0 in ohms; broadcastable to the shape of the resistances.
+        scale: Mapping of R/R0 to codes.
 
     Returns:
         Codes with the same shape as ``resistance_ohm``.
@@ -140,15 +140,15 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
 
 
 def _all_measured(code: Float, distance: Float, scale: CodeScale) -> bool:
-    """Return whether all codes are certainly measurements and none is near a tie, as in nearly every scan.
+    """Return whether all codes are definitely measurements and none is near a tie (the usual case).
 
-    If the code range begins at least a step above 0, a ratio R/R0 inside the range implies that R and R0 are
-    positive and finite.
+    If the code range begins at least one step above 0, a ratio R/R0 inside the range implies that R and R0
+    are positive and finite.
 
     Args:
-        code: rounded positions in the code range; any shape.
-        distance: distance of each position from its code, codes.
-        scale: mapping of R/R0 to codes.
+        code: Rounded positions in the code range; any shape.
+        distance: Distance of each position from its code, in codes.
+        scale: Mapping of R/R0 to codes.
     """
     if not code.size or scale.lo < scale.step:
         return False
@@ -165,11 +165,11 @@ def _round_exactly(
     """Return the codes, rounded in exact arithmetic where they are near a tie.
 
     Args:
-        code: rounded positions in the code range; any shape.
-        near_tie: mask of the positions that cannot be rounded reliably in double precision.
-        resistance: resistances, ohm; broadcastable to the shape of ``code``.
-        baseline: R0, ohm; broadcastable to the shape of ``code``.
-        scale: mapping of R/R0 to codes.
+        code: Rounded positions in the code range; any shape.
+        near_tie: Mask of the positions that cannot be rounded reliably in double precision.
+        resistance: Resistances in ohms; broadcastable to the shape of ``code``.
+        baseline: R0 in ohms; broadcastable to the shape of ``code``.
+        scale: Mapping of R/R0 to codes.
     """
     exact = np.array(code)
     lo, steps_per_ratio = Fraction(scale.lo), scale.steps / (Fraction(scale.hi) - Fraction(scale.lo))
@@ -184,9 +184,9 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
     """Decode codes into resistances.
 
     Args:
-        codes: codes of any shape, which may include :data:`MISSING`.
-        baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
-        scale: mapping of R/R0 to codes.
+        codes: Codes of any shape, which may include :data:`MISSING`.
+        baseline_ohm: R0 in ohms; broadcastable to the shape of the codes.
+        scale: Mapping of R/R0 to codes.
 
     Returns:
         Resistances in ohms, and a mask of the valid resistances, both with the shape of ``codes``. Where the
@@ -200,8 +200,8 @@ class Decoder:
     """Decodes many scans with the same baseline; equivalent to :func:`decode`.
 
     Args:
-        baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
-        scale: mapping of R/R0 to codes.
+        baseline_ohm: R0 in ohms; broadcastable to the shape of the codes.
+        scale: Mapping of R/R0 to codes.
     """
 
     def __init__(self, baseline_ohm: ArrayLike, scale: CodeScale) -> None:
@@ -213,7 +213,7 @@ class Decoder:
         """Decode codes into resistances.
 
         Args:
-            codes: codes, which may include :data:`MISSING`.
+            codes: Codes, which may include :data:`MISSING`.
 
         Returns:
             Resistances in ohms, and a mask of the valid resistances.

@@ -39,9 +39,9 @@ def pack_command(
     """Pack the payload of RPDO1.
 
     Args:
-        tare: whether to make the current resistances the baseline.
-        single_scan: whether to take one scan immediately.
-        send_mode: send mode of the patch from now on.
+        tare: Whether to make the current resistances the baseline.
+        single_scan: Whether to take one scan immediately.
+        send_mode: Send mode of the patch from now on.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 
@@ -50,11 +50,11 @@ def unpack_command(data: bytes, *, cob_id: int = _COB_ID) -> Command:
     """Unpack the payload of RPDO1. Bytes beyond the six mapped bytes are ignored (CiA 301).
 
     Args:
-        data: payload of the frame.
+        data: Payload of the frame.
         cob_id: COB-ID for the error message.
 
     Raises:
-        CodecError: if the payload is shorter than six bytes.
+        CodecError: If the payload is shorter than six bytes.
     """
     if len(data) < _COMMAND.size:
         raise CodecError(cob_id, data, f"at least {_COMMAND.size} bytes (command)")

@@ -1,8 +1,8 @@
 """Packs and unpacks a patch's electrode coordinates (object 0x2300).
 
-Each coordinate is a little-endian signed 32-bit integer in nanometres. The object contains x, y and z of each
-upper electrode, wire by wire, and then of each lower electrode. The layout hash is also computed from whole
-nanometres, so packing and unpacking a layout preserves its hash.
+Each coordinate is a little-endian signed 32-bit integer in nanometres. The object contains x, y and z for
+each upper electrode, wire by wire, and then for each lower electrode. The layout hash is also computed from
+whole nanometres, so packing and unpacking a layout preserves its hash.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _BYTES = 12  # per electrode
 
 
 def pack_coordinates(layout: PatchLayout) -> bytes:
-    """Return the content of 0x2300 for a layout. Raises ConfigError if a coordinate exceeds 2.1 m."""
+    """Return the contents of 0x2300 for a layout. Raises ConfigError if a coordinate exceeds 2.1 m."""
     nanometres = np.rint(np.concatenate([a.ravel() for a in (layout.upper_m, layout.lower_m)]) / _NANOMETRE_M)
     farthest = float(np.abs(nanometres).max())
     if farthest >= 2**31:
@@ -30,7 +30,7 @@ def pack_coordinates(layout: PatchLayout) -> bytes:
 def unpack_coordinates(
     data: bytes, profile: PatchProfile, resistivity_ohm_per_m: float, name: str = "custom"
 ) -> PatchLayout:
-    """Return the layout in the content of 0x2300.
+    """Return the layout given by the contents of 0x2300.
 
     Raises ConfigError if the length does not match the sizes in ``profile``, and ValueError if the
     coordinates do not form a valid layout.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 TIME_STEP_US: Final = 64
-"""Resolution of the 16-bit device time, µs.
+"""Resolution of the 16-bit device time in µs.
 
 The 16-bit time consists of bits 6 to 21 of the 32-bit time. It wraps every 4.2 s, so the host can restore the
 upper bits if it can predict the device time to within 2 s.
@@ -13,41 +13,41 @@ upper bits if it can predict the device time to within 2 s.
 TIME_SHIFT: Final = 6
 """Number of bits by which a time in µs is shifted right to give a time in steps of 64 µs."""
 TIME_WRAP_US: Final = TIME_STEP_US << 16
-"""Period after which the 16-bit device time wraps, µs; about 4.2 s."""
+"""Period in µs after which the 16-bit device time wraps; about 4.2 s."""
 
 
 def restore_time_us(low_us: int, expected_us: int) -> int:
     """Return the device time (µs) with the given low bits that is nearest to the expected time.
 
     Args:
-        low_us: device time from a summary with a check, without its upper bits, µs.
-        expected_us: expected device time, µs.
+        low_us: Device time (µs) without its upper bits, from a summary with a check.
+        expected_us: Expected device time, µs.
     """
     return expected_us + (low_us - expected_us + TIME_WRAP_US // 2) % TIME_WRAP_US - TIME_WRAP_US // 2
 
 
 class DeviceTimeTracker:
-    """Restores the upper bits of successive device times of a node."""
+    """Restores the upper bits of a node's successive device times."""
 
     def __init__(self) -> None:
         # last restored device time (µs) and its arrival time (ns); both 0 before the first summary
         self._time_us = self._t_time_ns = 0
 
     def reset(self) -> None:
-        """Forget the last device time, for example after a restart of the node."""
+        """Forget the last device time, for example after the node restarts."""
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
-        """Return the 32-bit device time, µs.
+        """Return the 32-bit device time in µs.
 
-        The expected time is the last device time plus the time that has since elapsed on the host's clock.
-        For the first summary, the expected time is the host's time. The upper bits of this first device time
-        are correct only if the node and the host share a clock and the summary arrives within three seconds
-        of its scan.
+        The expected time is the last device time plus the time that has elapsed since then on the host's
+        clock. For the first summary, the expected time is the host's time. The upper bits of the first device
+        time are correct only if the node and the host share a clock and the summary arrives within three
+        seconds of its scan.
 
         Args:
-            low_us: device time from a summary with a check, without its upper bits, µs.
-            t_ns: arrival time of the summary on the host's monotonic clock, ns.
+            low_us: Device time (µs) without its upper bits, from a summary with a check.
+            t_ns: Arrival time of the summary on the host's monotonic clock, ns.
         """
         expected_us = self._time_us + (t_ns - self._t_time_ns) // 1000
         if not self._t_time_ns:

@@ -12,26 +12,26 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def eds_name(profile: PatchProfile) -> str:
-    """Return the file name of the EDS of a patch."""
+    """Return the file name of a patch's EDS."""
     variant = "-fd" if profile.bus == "fd" else ""
     return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}{variant}.eds"
 
 
 def eds_text(profile: PatchProfile) -> str:
-    """Return the content of a patch's EDS, which depends only on the profile."""
+    """Return the contents of a patch's EDS, which depends only on the profile."""
     return render_eds(device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
-    """Return the content of a patch's DCF, which depends only on the arguments.
+    """Return the contents of a patch's DCF, which depends only on the arguments.
 
     Args:
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
         node_id: 1 to 127.
-        bitrate_bps: bit rate of the bus, bit/s.
+        bitrate_bps: Bit rate of the bus, bit/s.
 
     Raises:
-        ConfigError: if the node-ID is not 1 to 127, or if the bit rate is not supported.
+        ConfigError: If the node-ID is not in the range 1 to 127, or the bit rate is not supported.
     """
     if not 1 <= node_id <= od.MAX_NODE_ID:
         raise ConfigError("node_id", node_id, "1 to 127")
@@ -44,11 +44,11 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
 
 
 def device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
-    """Return the general information in the EDS or DCF of a patch.
+    """Return the general information in a patch's EDS or DCF.
 
     Args:
-        profile: sizes of the patch.
-        file_name: name of the EDS or DCF.
+        profile: Sizes of the patch.
+        file_name: Name of the EDS or DCF.
     """
     variant = ", PDO over CAN FD" if profile.bus == "fd" else ""
     return DeviceInfo(
@@ -78,7 +78,7 @@ def write_reference_files(folder: Path) -> None:
     """Write the EDS file of every reference profile.
 
     Args:
-        folder: existing folder for the files.
+        folder: Folder for the files, which must exist.
     """
     for profile in REFERENCE_PROFILES:
         (folder / eds_name(profile)).write_text(eds_text(profile), encoding="ascii", newline="\n")

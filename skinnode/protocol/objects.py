@@ -23,17 +23,17 @@ DEFAULT_CODE_HI: Final = 1.25
 """Default R/R0 of the highest measurement code. A press reduces R, but sliding moves some electrodes apart
 and increases R above R0."""
 DEFAULT_THRESHOLD_CODES: Final = 2
-"""Default largest change in a code that is not sent in send mode 1, codes."""
+"""Default send threshold, in codes: the largest code change that is not sent in send mode 1."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Default interval between full scans in send mode 1 (changed chunks only), scans. At a scan period of 80 ms,
-a lost chunk is sent again within 0.8 s. The full scans add a tenth of the traffic of send mode 0."""
+"""Default interval, in scans, between full scans in send mode 1 (changed chunks only). At 80 ms per scan, a
+lost chunk is sent again within 0.8 s. The full scans add one tenth of the traffic of send mode 0."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:
     """Return all objects in a patch's object dictionary, in ascending order of index.
 
     Args:
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
     """
     communication = communication_objects(
         _rpdos(profile), _tpdos(profile), profile.pdo_bytes, profile.revision_number

@@ -16,7 +16,7 @@ class HeldChunks:
     """Last known payloads of all chunks of a patch.
 
     Args:
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
     """
 
     def __init__(self, profile: PatchProfile) -> None:
@@ -27,15 +27,15 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all payloads, because a scan that may have changed them was lost."""
+        """Discard all payloads because a scan that may have changed them was lost."""
         self._payloads, self._decoded = [None] * self._profile.n_chunks, None
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
         """Store the payloads of a closed scan.
 
         Args:
-            received: payload of each chunk; None for a chunk that did not arrive.
-            carry: whether these chunks are unchanged and keep their last payloads.
+            received: Payload of each chunk; None for a chunk that did not arrive.
+            carry: Whether chunks that did not arrive are unchanged and keep their last payloads.
         """
         if carry and None in received:
             held = self._payloads
@@ -43,7 +43,7 @@ class HeldChunks:
         self._payloads, self._decoded = received, None
 
     def decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
-        """Decode all stored payloads. Until they change, every call returns the same read-only arrays.
+        """Decode all stored payloads. Until they change, return the same read-only arrays.
 
         Returns:
             (U, K) codes, with :data:`~skinnode.protocol.codes.MISSING` where unknown; a (U, K) mask of the

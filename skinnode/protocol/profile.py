@@ -7,7 +7,7 @@ starting with all codes of upper wire 0. The *summary* (TPDO2) ends the scan and
 
 **CAN FD.** A chunk carries codes of one upper wire. It consists of a u8 wire number, a u8 scan counter, the
 u16 number of the first column, and up to 30 codes of 16 bits or 20 codes of 24 bits. If an upper wire has
-more codes than fit into a chunk, they are split evenly among several chunks. All chunks of a patch have the
+more codes than fit in a chunk, they are split evenly among several chunks. All chunks of a patch have the
 same length, padded to a valid CAN FD length.
 
 The command ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period for which the default settings are chosen, ms. At this period, four 10×30 patches use about
-two thirds of the capacity of a 1 Mbit/s bus."""
+"""SYNC period in ms for which the default settings were chosen. With this period, four 10×30 patches use
+about two thirds of the capacity of a 1 Mbit/s bus."""
 
 BusType = Literal["classic", "fd"]
 """Frame format of PDOs: classic CAN (up to 8 bytes) or CAN FD (up to 64 bytes)."""
@@ -46,8 +46,8 @@ class PatchProfile:
     """Sizes of a patch and its wire format.
 
     Raises:
-        ConfigError: if a number of wires, electrodes or PDOs is out of range; if the code width is neither 16
-            nor 24 bits; or if a scan on classic CAN has more than 256 chunks.
+        ConfigError: If a number of wires, electrodes or PDOs is out of range; if the code width is neither 16
+            nor 24 bits; or if a scan on classic CAN would have more than 256 chunks.
     """
 
     rows: int
@@ -59,7 +59,7 @@ class PatchProfile:
     lower_electrodes: int
     """Number of electrodes per lower wire, M."""
     code_bits: int = 16
-    """Width of a code, bits: 16 or 24."""
+    """Width of a code in bits: 16 or 24."""
     rpdos: int = 4
     """Number of RPDOs. RPDO1 carries commands; the others are spare."""
     tpdos: int = 4
@@ -67,8 +67,8 @@ class PatchProfile:
     bus: BusType = "classic"
     """Frame format of PDOs."""
     checked: bool = True
-    """Whether summaries contain a 16-bit device time and a scan check. If false, as for patches of revision
-    1.0, they contain a 32-bit device time instead."""
+    """Whether summaries contain a 16-bit device time and a scan check. If false, as in revision 1.0 patches,
+    they contain a 32-bit device time instead."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -95,12 +95,12 @@ class PatchProfile:
 
     @classmethod
     def from_layout(cls, layout: PatchLayout, code_bits: int = 16, bus: BusType = "classic") -> PatchProfile:
-        """Return the profile of a patch with the electrodes of ``layout``.
+        """Return the profile of a patch that has the electrodes in ``layout``.
 
         Args:
-            layout: electrodes of the patch.
-            code_bits: width of a code in bits, 16 or 24.
-            bus: frame format of PDOs.
+            layout: Electrodes of the patch.
+            code_bits: Width of a code in bits, 16 or 24.
+            bus: Frame format of PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]
         columns, lower_electrodes = layout.lower_m.shape[:2]
@@ -118,12 +118,12 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum length of a PDO, bytes; also the maximum number of objects mapped into a PDO."""
+        """Maximum length of a PDO in bytes; also the maximum number of objects mapped into a PDO."""
         return 8 if self.bus == "classic" else 64
 
     @property
     def chunk_head_bytes(self) -> int:
-        """Length of a chunk's header, which precedes the codes, bytes."""
+        """Length in bytes of a chunk's header, which precedes the codes."""
         return 2 if self.bus == "classic" else 4
 
     @property
@@ -155,7 +155,7 @@ class PatchProfile:
 
     @property
     def chunk_bytes(self) -> int:
-        """Length of a chunk's payload, bytes."""
+        """Length of a chunk's payload in bytes."""
         if self.bus == "classic":
             return 8
         return fd_length(self.chunk_head_bytes + self.codes_per_chunk * self.code_bits // 8)
@@ -172,10 +172,10 @@ class PatchProfile:
 
     @property
     def default_inhibit_100us(self) -> int:
-        """Default inhibit time of TPDO1 (0x1800:3), in units of 100 µs, at most 1 ms.
+        """Default inhibit time of TPDO1 (0x1800:3) in units of 100 µs; at most 1 ms.
 
-        With this inhibit time, sending all chunks of a scan takes at most nine tenths of the default period,
-        for up to 720 chunks.
+        With this inhibit time, sending all chunks of a scan (up to 720) takes at most nine tenths of the
+        default period.
         """
         return max(1, min(10, 9 * DEFAULT_PERIOD_MS // self.n_chunks))
 

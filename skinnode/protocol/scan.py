@@ -24,7 +24,7 @@ class Scan:
     scan: int
     """Scan counter without wrap-around. It starts at the first counter received and increases."""
     complete: bool
-    """Whether the codes are known to be those that the node packed: all chunks arrived or are known to be
+    """Whether the codes are known to match those that the node packed: all chunks arrived or are known to be
     unchanged, and, in a checked stream, the check passed."""
     chunks_expected: int
     """Number of chunks sent, according to the summary; the number of chunks in a full scan if the summary was
@@ -32,9 +32,9 @@ class Scan:
     chunks_received: int
     """Number of chunks received."""
     device_time_us: int | None
-    """Time of the scan on the node's clock, µs, modulo 2³²; None if the summary was lost.
+    """Time of the scan on the node's clock in µs, modulo 2³²; None if the summary was lost.
 
-    A summary with a check carries the device time in steps of 64 µs and without its upper 10 bits, which the
+    A summary with a check carries the device time in steps of 64 µs, without its upper 10 bits, which the
     host restores (:mod:`skinnode.protocol.device_time`)."""
     flags: int
     """Summary flags (:class:`~skinnode.protocol.summary.SummaryFlag`); 0 if the summary was lost."""
@@ -50,7 +50,7 @@ class Scan:
 
     @property
     def empty(self) -> bool:
-        """Whether the node sent chunks, but all of them were lost."""
+        """Whether the node sent chunks but all of them were lost."""
         return self.chunks_received == 0 < self.chunks_expected
 
 
@@ -61,10 +61,10 @@ class AssemblerStats:
     scans_complete: int
     """Scans published as complete."""
     scans_torn: int
-    """Scans published with chunks missing."""
+    """Scans published with missing chunks."""
     scans_unchecked: int
     """Scans published as incomplete although all their chunks arrived, because the check was impossible: the
-    summary was lost, or the codes of unsent chunks were unknown."""
+    summary was lost or the codes of unsent chunks were unknown."""
     scans_missed: int
     """Scans from which no frame arrived, inferred from gaps in the scan counter."""
     scans_discarded: int
@@ -72,16 +72,16 @@ class AssemblerStats:
     scans_mixed: int
     """Scans discarded because they seem to contain frames of two scans with the same counter."""
     scans_corrupt: int
-    """Scans discarded because the check failed: at least one code differs from what the node packed."""
+    """Scans discarded because the check failed: at least one code differs from the node's code."""
     scans_joined: int
-    """Incomplete scans discarded because reception began after the node had started to send them."""
+    """Incomplete scans discarded because reception began after the node had started sending them."""
     chunks_accepted: int
     """* Chunks assigned to a scan."""
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing from published scans. If the node sends only changed chunks, a scan without a summary is
-    not counted, because the number of its chunks is unknown."""
+    """Chunks missing from published scans. If the node sends only changed chunks, chunks of a scan without a
+    summary are not counted, because the number sent is unknown."""
     summaries_lost: int
     """Summaries missing from published scans."""
     duplicates: int

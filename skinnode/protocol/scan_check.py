@@ -19,7 +19,7 @@ def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
 
     Args:
         codes: (U, K) codes of all chunks, including those not sent in this scan.
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
     """
     if profile.code_bits == 16:
         return binascii.crc_hqx(codes.astype("<u2").tobytes(), CRC_INITIAL)
@@ -32,20 +32,20 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
 
     The algorithm is CRC-16/IBM-3740: polynomial x¹⁶ + x¹² + x⁵ + 1 (0x1021), initial value 0xFFFF, most
     significant bit first, not inverted. The CRC of the ASCII digits ``123456789`` is 0x29B1. The CRC covers,
-    in this order:
+    in order:
 
     1. All U·K codes, ordered by upper wire. Each code is little-endian, with 2 bytes for 16-bit codes and 3
-       bytes for 24-bit codes. For an unsent chunk, these are the codes that were last sent, which may differ
-       from the measured codes by up to the delta threshold.
+       bytes for 24-bit codes. For an unsent chunk, these are the codes that were last sent, which can differ
+       from the measured codes by up to the send threshold.
     2. The first 6 bytes of the summary: scan counter, flags, number of chunks sent, and device time. Codes of
        another scan fail the check, because their scan counter or device time differs.
 
-    The check detects every error burst of up to 16 bits, such as one wrong 16-bit code, and every odd number
-    of bit errors. With up to 4,087 bytes of codes, it also detects every double bit error. Of all other
-    errors, one in 65,536 goes undetected.
+    The check detects every error burst of up to 16 bits, such as a single wrong 16-bit code, and every odd
+    number of bit errors. With up to 4,087 bytes of codes, it also detects every double bit error. Of all
+    other errors, one in 65,536 goes undetected.
 
     Args:
-        check_of_codes: result of :func:`check_of_codes`.
-        head: the first 6 bytes of the summary.
+        check_of_codes: Result of :func:`check_of_codes`.
+        head: The first 6 bytes of the summary.
     """
     return binascii.crc_hqx(head, check_of_codes)

@@ -29,12 +29,12 @@ class SelfTestFault(enum.IntFlag):
 
 
 class SelfTest(NamedTuple):
-    """Findings of a self-test, in the order of the sub-indices of 0x2023 from 2."""
+    """Findings of a self-test, in the order of the sub-indices of 0x2023, starting at 2."""
 
     faults: SelfTestFault
     readings: int
     noise: float
-    """Relative noise: RMS over all crossings of the standard deviation divided by the mean."""
+    """Relative noise: RMS over all crossings of the relative standard deviation."""
     open_wires: int
     shorted_wires: int
     out_of_range: int
@@ -43,13 +43,13 @@ class SelfTest(NamedTuple):
 
 _SELF_TEST: Final = struct.Struct("<BHBfHHII")
 SELF_TEST_NEVER_RUN: Final = bytes(_SELF_TEST.size)
-"""Content of record 0x2023 before the first self-test."""
+"""Contents of record 0x2023 before the first self-test."""
 
 
 def pack_self_test(test: SelfTest) -> bytes:
-    """Return the content of record 0x2023 after a self-test.
+    """Return the contents of record 0x2023 after a self-test.
 
     Args:
-        test: findings of the self-test, which has passed if there are no faults.
+        test: Findings of the self-test, which passes if there are no faults.
     """
     return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)

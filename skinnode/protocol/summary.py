@@ -16,7 +16,7 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Number of leading bytes of a summary that the scan check covers."""
+"""Number of leading bytes of a summary that are covered by the scan check."""
 
 
 class SummaryFlag(enum.IntFlag):
@@ -34,7 +34,7 @@ class SummaryFlag(enum.IntFlag):
     """The converter returned no valid reading. No chunks were sent, and the codes are unknown."""
     CHECKED = 0x20
     """Bytes 4 to 7 of the summary contain the u16 device time in steps of 64 µs and the u16 scan check.
-    Without this flag, as in patches of revision 1.0, bytes 4 to 7 contain the u32 device time in µs."""
+    Without this flag, as in revision 1.0 patches, bytes 4 to 7 contain the u32 device time in µs."""
     CONVERSIONS = 0xC0
     """Two-bit conversion phase. The phase cycles through 1, 2 and 3, and advances if the converter has
     completed a conversion of all crossings since the previous scan. Two successive scans with the same phase
@@ -51,15 +51,15 @@ class Summary(NamedTuple):
     chunks: int
     """Number of chunks sent in this scan."""
     device_time_us: int
-    """Time on the node's clock, µs, 0 to 2³² − 1. In a summary with a ``check``, only bits 6 to 21 are known
-    and all others are 0; see :mod:`skinnode.protocol.device_time`."""
+    """Time on the node's clock in µs, 0 to 2³² − 1. In a summary with a ``check``, only bits 6 to 21 are
+    known and all others are 0; see :mod:`skinnode.protocol.device_time`."""
     check: int | None = None
     """Scan check (:mod:`skinnode.protocol.scan_check`); None if :attr:`SummaryFlag.CHECKED` is not set."""
 
 
 PHASES: Final = 3
 """Number of conversion phases, not counting 0. A phase can be compared only with the phase of the previous
-scan: after missed scans, it may have wrapped."""
+scan: after missed scans, the phase may have wrapped."""
 PHASE_SHIFT: Final = 6
 """Number of the lowest bit of the conversion phase in the flags."""
 
@@ -77,16 +77,16 @@ def conversion_flags(phase: int) -> int:
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
-    """Pack a summary without a check into the payload of TPDO2, for a patch of revision 1.0.
+    """Pack a summary without a check into the payload of TPDO2, for a revision 1.0 patch.
 
     Args:
-        scan: scan counter, 0 to 255.
-        flags: bits of :class:`SummaryFlag` without ``CHECKED``.
-        chunks: number of chunks sent in this scan.
-        device_time_us: time on the node's clock, µs; wraps at 2³².
+        scan: Scan counter, 0 to 255.
+        flags: Bits of :class:`SummaryFlag` without ``CHECKED``.
+        chunks: Number of chunks sent in this scan.
+        device_time_us: Time on the node's clock in µs; wraps at 2³².
 
     Raises:
-        ValueError: if the scan counter, the flags or the number of chunks does not fit into its field.
+        ValueError: If the scan counter, the flags or the number of chunks does not fit in its field.
     """
     try:
         return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
@@ -97,18 +97,18 @@ def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> byt
 def pack_checked_summary(
     scan: int, flags: int, chunks: int, device_time_us: int, check_of_codes: int
 ) -> bytes:
-    """Pack a summary with a check into the payload of TPDO2, and set :attr:`SummaryFlag.CHECKED`.
+    """Pack a summary with a check into the payload of TPDO2 and set :attr:`SummaryFlag.CHECKED`.
 
     Args:
-        scan: scan counter, 0 to 255.
-        flags: bits of :class:`SummaryFlag`.
-        chunks: number of chunks sent in this scan.
-        device_time_us: time on the node's clock, µs; wraps at 2³².
-        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for all codes after
+        scan: Scan counter, 0 to 255.
+        flags: Bits of :class:`SummaryFlag`.
+        chunks: Number of chunks sent in this scan.
+        device_time_us: Time on the node's clock in µs; wraps at 2³².
+        check_of_codes: Result of :func:`~skinnode.protocol.scan_check.check_of_codes` for all codes after
             this scan, including those of unsent chunks.
 
     Raises:
-        ValueError: if the scan counter, the flags or the number of chunks does not fit into its field.
+        ValueError: If the scan counter, the flags or the number of chunks does not fit in its field.
     """
     steps = device_time_us >> TIME_SHIFT & 0xFFFF
     try:
@@ -119,13 +119,13 @@ def pack_checked_summary(
 
 
 def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
-    """Return the content of record 0x2011 for a summary.
+    """Return the contents of record 0x2011 for a summary.
 
     In a summary with a check, the full device time is inserted before the 16-bit device time.
 
     Args:
-        payload: the payload of TPDO2.
-        device_time_us: time on the node's clock, µs; wraps at 2³².
+        payload: The payload of TPDO2.
+        device_time_us: Time on the node's clock in µs; wraps at 2³².
     """
     if not payload[1] & _CHECKED:
         return payload
@@ -136,11 +136,11 @@ def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
     """Unpack a summary (with or without a check) from the payload of TPDO2.
 
     Args:
-        data: payload of the frame.
+        data: Payload of the frame.
         cob_id: COB-ID for the error message.
 
     Raises:
-        CodecError: if the payload is not 8 bytes long.
+        CodecError: If the payload is not 8 bytes long.
     """
     require_length(data, PDO_BYTES, cob_id, "scan summary")
     scan, flags, chunks, rest = _SUMMARY.unpack(data)

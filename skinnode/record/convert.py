@@ -1,8 +1,8 @@
-"""Converts recordings between file formats, and computes field tables from recordings.
+"""Converts recordings between file formats and computes field tables from recordings.
 
-The file suffixes determine the formats. A conversion between two files with frames copies every frame and the
+The file suffixes determine the formats. A conversion between two frame files copies every frame and the
 journal, so a replay of the result computes the same fields. An MCAP target also receives the fields, contacts
-and poses, which a replay computes. A field table contains the results of a replay and the resistances.
+and poses computed by a replay. A field table contains the results of a replay and the resistances.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Conversion:
     faults: tuple[str, ...]
     """Messages about missing or unreadable parts of the source."""
     notes: tuple[str, ...]
-    """Messages about assumptions, and about data that the target cannot contain."""
+    """Messages about assumptions and about data that the target cannot contain."""
 
 
 class FieldTable(Protocol):
@@ -101,7 +101,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
         raise ConfigError("source", str(source), _ending_in(TARGETS))
     allowed = TABLES if source.suffix in TABLES else TARGETS
     if target.suffix not in allowed:
-        why = "; a table of fields contains no frames" if source.suffix in TABLES else ""
+        why = "; a field table contains no frames" if source.suffix in TABLES else ""
         raise ConfigError("target", str(target), _ending_in(allowed) + why)
     if source.suffix in TABLES and hand is not None:
         raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
@@ -117,7 +117,7 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
 
 
 def _share_journal(source: Path, target: Path) -> bool:
-    """Return whether both files are logs with the same name in the same folder and so share a journal."""
+    """Return whether both files are logs with the same name and folder, and therefore share a journal."""
     both_logs = {source.suffix, target.suffix} <= set(WRITABLE)
     return both_logs and journal_of(source) == journal_of(target)
 
@@ -133,9 +133,9 @@ def _copy_mcap(source: Path, target: Path) -> Conversion:
 
 def _copy_table(source: Path, target: Path) -> Conversion:
     hand, rows = read_parquet(source) if source.suffix == PARQUET else read_npz(source)
-    lost = f"{target.name} cannot contain contacts and faults" if target.suffix == NPZ else None
+    lost = f"{target.name} cannot contain contacts or faults" if target.suffix == NPZ else None
     if source.suffix == NPZ and target.suffix == PARQUET:
-        lost = f"{source.name} contains no contacts and faults"
+        lost = f"{source.name} contains no contacts or faults"
     fields = _write_table(target, hand, rows)
     return Conversion(0, fields, (), () if lost is None or source.suffix == target.suffix else (lost,))
 
@@ -201,7 +201,7 @@ def write_computed_field(file: McapFile, field: FieldFrame, rest_m: Float, offse
 
     Args:
         file: The file.
-        field: The field, with a stamp.
+        field: The field; must have a stamp.
         rest_m: (U, N, 3) electrode positions at rest, m.
         offset_ns: Time since 1970 minus time on the stamp's clock, ns.
     """
@@ -251,7 +251,7 @@ class CopiedFrames:
 
 
 def _losses(recording: OpenRecording, target: Path, tee: CopiedFrames) -> list[str]:
-    """Describe, in at most one line, the data that the target cannot contain."""
+    """Return at most one line that describes the data that the target cannot contain."""
     lost = []
     from_mcap = recording.frames.path.suffix == MCAP
     if from_mcap and target.suffix != MCAP:
@@ -259,7 +259,7 @@ def _losses(recording: OpenRecording, target: Path, tee: CopiedFrames) -> list[s
         lost += ["times finer than 1 µs"]
     if target.suffix == ".asc":
         lost += ["the time zone"]
-        lost += ["identifier and data of error frames"] if tee.errors else []
+        lost += ["the identifiers and data of error frames"] if tee.errors else []
     return [f"{target.name} cannot contain {'; '.join(lost)}"] if lost else []
 
 

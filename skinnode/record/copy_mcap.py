@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
-    """Copy every readable message, with its times, topic and schema.
+    """Copy every readable message, including its times, topic and schema.
 
-    If the source is a recording that was not closed properly or is damaged, the journal of the copy records
-    this.
+    If the source is a recording that is damaged or was not closed properly, this is noted in the journal of
+    the copy.
 
     Returns:
         Numbers of CAN frames and fields copied, and a one-line message for each damaged part.
@@ -42,7 +42,7 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
         writer.start(profile=PROFILE, library="skinnode")
         schemas: dict[int, int] = {}
         channels: dict[int, int] = {}
-        last: tuple[int, Message] | None = None  # newest journal line, with its channel in the copy
+        last: tuple[int, Message] | None = None  # newest journal line and its channel in the copy
         ended = False
         for item in chunks.messages(None):
             channel, message, schema = item.channel, item.message, item.schema
@@ -81,7 +81,7 @@ def _ends(data: bytes) -> bool:
 
 
 def _add_repaired(writer: Writer, channel: int, last: Message, *, frames: int, damaged: int) -> None:
-    """Write the journal line of a repaired recording; ``last`` is the line before it."""
+    """Write the journal line that marks a repaired recording; ``last`` is the preceding line."""
     event = {"bus": "", "at": 0, "t_ns": 0, "event": "repaired", "frames": frames, "damaged": damaged}
     data = encode(message_type(JOURNAL_LINE)(json.dumps(event)), JOURNAL_LINE)
     writer.add_message(channel, last.log_time, data, last.publish_time, (last.sequence + 1) & 0xFFFF_FFFF)

@@ -1,7 +1,7 @@
 """Converts fields to table rows: one row per field, with a value in every column.
 
-Values that a field lacks are filled in: NaN for an unknown number, False for an unknown mask, 1 for an
-unknown data share, and ``displacement_std_m`` for an unknown ``core_std_m``. The column ``tested`` shows
+Values missing from a field are filled in: NaN for an unknown number, False for an unknown mask, 1 for an
+unknown data share, and ``displacement_std_m`` for an unknown ``core_std_m``. The ``tested`` column shows
 whether ``wires_trusted`` is known.
 """
 
@@ -34,11 +34,11 @@ NUMBERS: Final = {
     "touched": "|i1",
     "touch_odds": "<f8",
 }
-"""Columns with one number per field, and their types. ``time_ns`` is the time of the SYNC or, if the SYNC is
-unknown, of the last frame, in ns since 1970. The other times are on the host's monotonic clock. ``touched``
+"""Columns with one number per field, and their types. ``time_ns`` is the time in ns since 1970 of the SYNC
+or, if the SYNC is unknown, of the last frame. The other times are on the host's monotonic clock. ``touched``
 is 1 or 0, or -1 if unknown; unknown ``touch_odds`` are NaN."""
 TEXTS: Final = ("method", "distrust")
-"""Columns with one text per field."""
+"""Columns with one string per field."""
 WIRES: Final = {
     "status": "|u1",
     "residual": "<f8",
@@ -62,8 +62,8 @@ class FieldRow:
 
     patch: str
     columns: Columns
-    """Value of each column in :data:`NUMBERS`, :data:`TEXTS`, :data:`WIRES`, :data:`POINTS` and
-    :data:`CROSSINGS`, by name."""
+    """Values by name of all columns in :data:`NUMBERS`, :data:`TEXTS`, :data:`WIRES`, :data:`POINTS` and
+    :data:`CROSSINGS`."""
     contacts: list[Columns] | None = None
     """Contacts; None if unknown."""
     faults: list[Columns] | None = None
@@ -71,10 +71,10 @@ class FieldRow:
 
 
 def row_of(field: FieldFrame, resistance: ResistanceFrame, offset_ns: int) -> FieldRow:
-    """Return a field as a table row.
+    """Convert a field to a table row.
 
     Args:
-        field: The field, with a stamp.
+        field: The field; must have a stamp.
         resistance: Resistances from which the field was computed.
         offset_ns: Time since 1970 minus time on the stamp's clock, ns.
     """

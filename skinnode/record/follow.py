@@ -14,23 +14,23 @@ from skinnode.process import clock
 from skinnode.record.recorder import Recorder
 
 HEALTH_S: Final = 1.0
-"""Interval at which the health of all patches and buses is recorded, s."""
+"""Interval (s) at which the health of all patches and buses is recorded."""
 
 CAPACITY_FIELDS: Final = 4096
-"""Maximum number of fields queued for the recorder: about ten seconds for sixteen patches."""
+"""Maximum number of fields queued for the recorder; about ten seconds of fields from sixteen patches."""
 
 _POLL_S: Final = 0.2
 
 
 @contextlib.contextmanager
 def followed(recorder: Recorder, host: Host) -> Iterator[None]:
-    """Record the fields, contacts, health and events of ``host`` while the ``with`` block is active.
+    """Record the fields, contacts, health and events of ``host`` during the ``with`` block.
 
     If the host closes after the block, the fields of scans that end during the shutdown are also recorded, so
     the recording contains the same fields as its replay.
 
-    Has no effect if the recording is not an MCAP file. If the disk is slow, the recorder drops the oldest
-    queued fields and counts them in ``RecorderStats.fields_dropped``; the host is not delayed.
+    This has no effect if the recording is not an MCAP file. If the disk is slow, the recorder drops the
+    oldest queued fields and counts them in ``RecorderStats.fields_dropped``; the host is not delayed.
 
     Args:
         recorder: Recorder of the host's frames.
@@ -52,7 +52,7 @@ def followed(recorder: Recorder, host: Host) -> Iterator[None]:
 
 
 def _watch(recorder: Recorder, host: Host, events: EventSubscription, over: threading.Event) -> None:
-    """Record each event immediately, and the health every second and at the end."""
+    """Record each event immediately, and record the health every second and at the end."""
     due_s = clock.monotonic()
     ended = False
     while not ended:

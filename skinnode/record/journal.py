@@ -3,7 +3,7 @@
 The journal is a JSON Lines file next to the log or, in an MCAP file, a topic with one message per line.
 The first line contains the hand and the offset of the host's clock (:class:`Header`). Every other line is an
 event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
-the event, and ``t_ns`` its time on the host's monotonic clock.
+the event, and ``t_ns`` is its time on the host's monotonic clock.
 
 =============  ==============================================================================
 ``event``      meaning
@@ -12,12 +12,13 @@ the event, and ``t_ns`` its time on the host's monotonic clock.
                if it differs from the hand's) or, without ``facts``, with the same solver as before;
                ``anew``: scans assembled so far are discarded
 ``withheld``   scans of ``patch`` are no longer decoded
-``polled``     a timeout ended a scan that lacked frames
+``polled``     a timeout ended an incomplete scan
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
-``dropped``    ``frames`` were not written, because the disk was too slow
+``dropped``    ``frames`` frames were not written because the disk was too slow
 ``repaired``   the file is a copy of the readable part of a recording, with ``frames`` frames; ``damaged``
                counts the unreadable parts before the end
-``ended``      the recording was closed with ``frames`` in the log; if this event is missing, the process was
+``ended``      the recording was closed with ``frames`` frames in the log; if this event is missing, the
+process was
                killed or the disk was full
 =============  ==============================================================================
 """
@@ -66,20 +67,20 @@ COMPLAINTS_KEPT: Final = 100
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line, bytes. An event with the baseline and the layout of the largest patch fits; a
+"""Maximum length of a line in bytes. An event containing the baseline and layout of the largest patch fits; a
 longer line is read as several lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Content of the first line of a journal."""
+    """Contents of the first line of a journal."""
 
     hand: HandConfig
     started: str
-    """Local date and time at which the recording began, ISO 8601."""
+    """Local date and time at which the recording began, in ISO 8601 format."""
     wall_minus_mono_ns: int
-    """Difference between the log's timestamps and the host's monotonic clock, ns."""
+    """Log timestamp minus time on the host's monotonic clock, in ns."""
 
     def line(self) -> str:
         """Return the header as a line of JSON."""
@@ -89,7 +90,7 @@ class Header:
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names, because the journal contains the data of these files."""
+    """Remove file names, because the journal contains the data from those files."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -178,7 +179,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], l
 
 
 def _noted(lines: Iterable[bytes], kept: list[bytes]) -> Iterator[bytes]:
-    """Yield the lines, and append them to ``kept``."""
+    """Yield the lines and append them to ``kept``."""
     for line in lines:
         kept.append(line)
         yield line
@@ -192,7 +193,7 @@ def parse_journal(
     Args:
         where: Path of the file, for error messages.
         name: Name of the file in messages about unreadable lines.
-        lines: The lines, each with its line feed.
+        lines: The lines, including their line feeds.
 
     Returns:
         The header, the events, and a one-line message for each unreadable line.
@@ -260,7 +261,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
 
 
 def _whole(value: object, least: int = 0) -> int:
-    """Return ``value``. Raises ValueError if ``value`` is not a 64-bit integer, or is less than ``least``."""
+    """Return ``value``. Raises ValueError if ``value`` is not a 64-bit integer or is less than ``least``."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
         raise ValueError
     return value

@@ -14,12 +14,12 @@ from skinnode.protocol.scan import Scan
 
 
 class KeepingSolver(ScanSolver):
-    """Solver that keeps the resistances of each solved scan, NaN where they were not used.
+    """Solver that keeps the resistances of each solved scan; NaN where a resistance was not used.
 
     Args:
         facts: Layout, code scale and baseline of the patch.
         hand: The hand.
-        now: Function that returns the monotonic time, ns.
+        now: Function that returns the monotonic time in ns.
         kept: Queue to which the resistances are appended, in the order of the fields; the caller removes
             them.
     """

@@ -1,4 +1,4 @@
-"""Writes a recording as a candump log or a BLF file, with the journal in a file next to it."""
+"""Writes a recording as a candump log or a BLF file, with the journal in a separate file next to it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class LogFiles:
         return self._log.frames
 
     def write(self, bus: str, frame: Frame, *, sent: bool, log_ns: int) -> None:
-        """Write a frame. Its ``t_ns`` is a time since 1970; the format cannot store ``log_ns``."""
+        """Write a frame. The frame's ``t_ns`` is a time since 1970; the format cannot store ``log_ns``."""
         self._log.write(LoggedFrame(frame, self._channels[bus], sent))
 
     def write_line(self, line: str, log_ns: int) -> None:
@@ -54,7 +54,7 @@ class LogFiles:
             self._journal.write(line + "\n")
 
     def flush(self, *, to_disk: bool) -> None:
-        """Flush the journal before the log, so the journal on disk is never older than the log."""
+        """Flush the journal before the log, so that the journal on disk is never older than the log."""
         if self._journal is not None:
             self._journal.flush()
         self._log.flush(to_disk=to_disk)
@@ -65,7 +65,7 @@ class LogFiles:
             self._journal.flush()
 
     def close(self) -> None:
-        """Close the files. Ignores disk errors, because earlier calls have reported them."""
+        """Close the files. Disk errors are ignored because earlier calls have reported them."""
         if self._journal is not None:
             with contextlib.suppress(OSError):
                 self._journal.close()

@@ -25,12 +25,12 @@ from skinnode.transport.frame_log_reader import DAMAGES_KEPT, Damage
 MAGIC: Final = b"\x89MCAP0\r\n"
 
 _HEAD: Final = struct.Struct("<BQ")  # opcode and length of each record
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # two times, size, checksum, length of the next word
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # two times, size, checksum, length of the compression name
 _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _MOST_CHUNK: Final = 1 << 26
-"""Maximum uncompressed chunk size, bytes; the usual size is 1 MiB. A larger size indicates damage."""
+"""Maximum uncompressed chunk size in bytes; the usual size is 1 MiB. A larger size indicates damage."""
 TRUNCATED: Final = "truncated"
-"""Description of a file that ends in the middle of a record."""
+"""Description of damage in which a file ends in the middle of a record."""
 _AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
 
 
@@ -42,7 +42,7 @@ class McapMessage:
     channel: Channel
     schema: Schema | None
     offset: int
-    """Offset of the message's chunk in the file, bytes."""
+    """Offset of the message's chunk in the file, in bytes."""
 
 
 class McapChunks:
@@ -102,10 +102,11 @@ class McapChunks:
     def _records(
         self, data: mmap.mmap, wanted: Callable[[int], bool] | None
     ) -> Iterator[tuple[int, McapRecord]]:
-        """Yield the records in all chunks, each with its chunk's offset.
+        """Yield all records, each with the offset of its chunk.
 
-        A damaged length may point beyond intact chunks. If a chunk's checksum is correct, so is its length.
-        The length of any other record is accepted if the next record is plausible or no intact chunk follows.
+        A corrupt length field may point beyond intact chunks. If a chunk's checksum is correct, so is its
+        length. The length of any other record is accepted if the next record is plausible or no intact chunk
+        follows.
         """
         at, size = len(MAGIC), len(data)
         while at < size:
@@ -180,7 +181,7 @@ def _parsed(opcode: int, data: bytes) -> McapRecord:
 
 
 def _end_of(data: mmap.mmap, at: int) -> int | None:
-    """Return the offset after the record at ``at``; None if there is no complete record."""
+    """Return the end offset of the record at ``at``; None if there is no complete record."""
     if at + _HEAD.size > len(data):
         return None
     opcode, length = _HEAD.unpack_from(data, at)
@@ -219,7 +220,7 @@ def _find_chunk(data: mmap.mmap, at: int) -> int:
 
 
 def _decompressed(chunk: Chunk) -> Chunk:
-    """Decompress a chunk. Raises ValueError if its content would be larger than its stated size."""
+    """Decompress a chunk. Raises ValueError if the result would be larger than the chunk's stated size."""
     size, data = chunk.uncompressed_size, chunk.data
     if size > _MOST_CHUNK:
         raise ValueError(f"{size} bytes, must be at most {_MOST_CHUNK}")
@@ -227,7 +228,7 @@ def _decompressed(chunk: Chunk) -> Chunk:
         import zstandard
 
         if zstandard.frame_content_size(data) > size:
-            raise ValueError("contains more than it claims")
+            raise ValueError("larger than its stated size")
         data = zstandard.decompress(data, max_output_size=size)
     elif chunk.compression == "lz4":
         import lz4.frame

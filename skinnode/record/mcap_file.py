@@ -5,7 +5,7 @@ If the process is killed, the file contains every chunk up to the last flush and
 end.
 
 A message's log time is the time at which the recorder received it. A frame's publish time is its arrival
-time; a field's publish time is the time at which it was solved.
+time; a field's publish time is the time at which the field was solved.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BUS_KEY: Final = "skinnode.bus"
 SENT_KEY: Final = "skinnode.sent"
 """Channel metadata key: ``1`` if the host sent the channel's frames, otherwise ``0``."""
 CHUNK_BYTES: Final = 1 << 20
-"""Maximum uncompressed chunk size, bytes."""
+"""Maximum uncompressed chunk size in bytes."""
 
 _LATCHED: Final = """\
 - history: 1
@@ -55,7 +55,7 @@ _LATCHED: Final = """\
   liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
   avoid_ros_namespace_conventions: false
 """
-"""QoS of ``/tf_static`` as rosbag2 writes it: reliable and transient local."""
+"""QoS of ``/tf_static``, as written by rosbag2: reliable and transient local."""
 
 
 class McapFile:
@@ -114,7 +114,7 @@ class McapFile:
         """Write a field and its contacts.
 
         Args:
-            field: The field, with a stamp.
+            field: The field; must have a stamp.
             rest_m: (U, N, 3) electrode positions at rest, m.
             offset_ns: Time since 1970 minus time on the stamp's clock, ns.
             log_ns: Time since 1970 at which the recorder received the field, ns.
@@ -140,15 +140,15 @@ class McapFile:
         self._write(TF_STATIC, TRANSFORMS, transforms(self._skeleton, log_ns), log_ns, log_ns)
 
     def write_event(self, event: HealthEvent, offset_ns: int, log_ns: int) -> None:
-        """Write an event; ``offset_ns`` is the time since 1970 minus the time on the event's clock, ns."""
+        """Write an event; ``offset_ns`` is the time since 1970 minus the time on the event's clock."""
         t_ns = event.t_ns + offset_ns
         self._write(self._topics.events, LOG, log_message(event, t_ns), t_ns, log_ns)
 
     def flush(self, *, to_disk: bool) -> None:
-        """End the chunk and pass it to the operating system, so that it survives if the process is killed.
+        """End the chunk and pass it to the operating system; it is then kept even if the process is killed.
 
         Args:
-            to_disk: Whether to wait until the file is on disk and would survive a power failure.
+            to_disk: Whether to wait until the file is on disk, where it would survive a power failure.
         """
         self._writer.flush()
         if to_disk:
@@ -159,7 +159,7 @@ class McapFile:
         self.flush(to_disk=False)
 
     def close(self) -> None:
-        """Write the index and close the file. Ignores disk errors, which earlier calls have reported."""
+        """Write the index and close the file, ignoring disk errors, which earlier calls have reported."""
         with contextlib.suppress(OSError):
             self._writer.finish()
             self._file.flush()

@@ -1,4 +1,4 @@
-"""Reads the journal and CAN frames from an MCAP file: a recording, or a ROS 2 bag with CAN frames."""
+"""Reads the journal and CAN frames from an MCAP file: a recording or a ROS 2 bag with CAN frames."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _SENT_TOPICS = ("to_can_bus", "to_can_bus_fd")
 
 
 class McapReader:
-    """Iterable over the CAN frames of an MCAP file. A frame's channel is the name of its bus.
+    """Iterable over the CAN frames in an MCAP file. A frame's channel is the name of its bus.
 
     If the file does not name the bus, the channel is the namespace of a ros2_socketcan topic, such as
-    ``can0`` in ``/can0/from_can_bus``, or the whole name of any other topic.
+    ``can0`` in ``/can0/from_can_bus``, or the full name of any other topic.
 
     Raises:
-        ConfigError: The file cannot be read, is not an MCAP file, or contains a newer version of our
+        ConfigError: The file cannot be read, is not an MCAP file, or contains newer versions of skinnode
             messages; or a package for the mcap extra is missing.
     """
 
@@ -49,7 +49,7 @@ class McapReader:
 
     @property
     def damages(self) -> list[Damage]:
-        """First damaged parts of the file."""
+        """Damaged parts found so far; only the first few are kept."""
         return self._chunks.damages
 
     @property
@@ -58,7 +58,7 @@ class McapReader:
         return self._chunks.damaged
 
     def close(self) -> None:
-        """Do nothing, because the file is open only while it is being read."""
+        """Do nothing because the file is open only while it is being read."""
 
     def journal(self) -> Iterator[bytes]:
         """Yield the journal lines."""
@@ -79,7 +79,7 @@ class McapReader:
                 self._chunks.complain(item.offset, f"a message that cannot be read ({error})")
 
     def _check(self, schema: Schema) -> None:
-        """Raise ConfigError if one of our messages has a newer version than this program knows."""
+        """Raise ConfigError if a skinnode message type is newer than this program supports."""
         if not schema.name.startswith(OURS):
             return
         found = version_of(schema.data.decode("utf-8", "replace"))
@@ -90,7 +90,7 @@ class McapReader:
 
 
 def _bus_of(channel: Channel) -> tuple[str, bool]:
-    """Return the bus of a channel's frames, and whether the recording program sent them."""
+    """Return the bus of a channel's frames and whether the recording program sent them."""
     bus, sent = channel.metadata.get(BUS_KEY), channel.metadata.get(SENT_KEY)
     parent, _, last = channel.topic.rpartition("/")
     if bus is None:

@@ -26,7 +26,7 @@ _HAND_NAME: Final = "hand"
 
 
 class NpzFile:
-    """New NPZ field table. Until :meth:`close`, the rows are kept in temporary files, not in memory.
+    """New NPZ field table. Rows are kept in temporary files, not in memory, until :meth:`close` is called.
 
     Args:
         path: Path of the new file.
@@ -60,7 +60,7 @@ class NpzFile:
 
 
 class _Rows:
-    """Rows of one patch in a temporary file of records; each text is stored as an index into a list."""
+    """Rows of one patch in a temporary file of records; each string is stored as an index into a list."""
 
     def __init__(self, path: Path, first: FieldRow) -> None:
         self._path = path
@@ -123,10 +123,10 @@ def read_npz(path: Path) -> tuple[str, Iterator[FieldRow]]:
     """Open an NPZ field table.
 
     Returns:
-        First line of the journal, which contains the hand; and the rows, one patch after another.
+        First line of the journal, which contains the hand, and the rows, one patch after another.
 
     Raises:
-        ConfigError: The file is not an NPZ field table, or has a different version.
+        ConfigError: The file is not an NPZ field table or has a different version.
     """
     allowed = "an NPZ file of fields written by skinnode convert"
     try:

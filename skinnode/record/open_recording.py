@@ -1,4 +1,4 @@
-"""Opens recordings, and logs from other masters, for a replay or a conversion."""
+"""Opens recordings and logs from other masters for replay or conversion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Frames(Protocol):
 
     @property
     def damages(self) -> list[Damage]:
-        """First damaged parts of the file."""
+        """Damaged parts found so far; only the first few are kept."""
 
     @property
     def damaged(self) -> int:
@@ -51,15 +51,15 @@ class ChannelMap:
 
     Args:
         bus_of: Bus name of each channel.
-        only: Bus to which the first frame's channel belongs if that channel is unknown; no other channel then
-            belongs to a bus. None if an unknown channel never belongs to a bus.
+        only: Bus assigned to the first frame's channel if that channel is unknown; no other channel then
+            belongs to a bus. If None, unknown channels never belong to a bus.
     """
 
     def __init__(self, bus_of: dict[str, str], only: str | None = None) -> None:
         self._bus_of, self._only = bus_of, only
 
     def bus(self, channel: str) -> str | None:
-        """Return the name of a channel's bus; None if the channel belongs to no bus of the hand."""
+        """Return the name of a channel's bus; None if the channel belongs to none of the hand's buses."""
         only, self._only = self._only, None
         if only is not None and channel not in self._bus_of:
             self._bus_of = {channel: only}
@@ -81,13 +81,13 @@ class OpenRecording:
     """Name of the file that contains the journal."""
     channels: ChannelMap
     foreign: bool = False
-    """True if there is no journal, so that the header and the events were created from a hand file."""
+    """Whether the header and the events were created from a hand file because there is no journal."""
     notes: tuple[str, ...] = ()
     """Assumptions made because there is no journal."""
 
 
 def open_recording(path: Path) -> OpenRecording:
-    """Open a recording with its journal.
+    """Open a recording and its journal.
 
     Args:
         path: A .mcap file, or a .log, .blf or .asc file whose journal is in the same folder.
@@ -101,7 +101,7 @@ def open_recording(path: Path) -> OpenRecording:
         reader = McapReader(path)
         raw = list(reader.journal())
         if not raw:
-            allowed = "a recording of skinnode; for other MCAP files with CAN frames, also give --hand"
+            allowed = "a skinnode recording; for other MCAP files with CAN frames, also give --hand"
             raise ConfigError("recording", str(path), allowed)
         header, events, complaints = parse_journal(str(path), f"{path.name} journal", raw)
         frames: Frames = reader
@@ -119,7 +119,7 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
     """Open a log without a journal, such as a candump log from a bus with another master.
 
     The patches are decoded with the layouts, code widths and baselines from the hand file. A patch without a
-    baseline file is assumed to have the resistances of its undeformed layout when at rest.
+    baseline file is assumed to have the resistances of its undeformed layout at rest.
 
     Args:
         path: File with CAN frames.
@@ -180,11 +180,11 @@ def _require_no_journal(path: Path) -> None:
     else:
         found, where = journal_of(path).exists(), journal_of(path).name
     if found:
-        raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} has the hand")
+        raise ConfigError("--hand", path.name, f"only for a log without a journal; {where} contains the hand")
 
 
 def _channels_in(path: Path, hand: HandConfig) -> dict[str, str]:
-    """Return the bus name of each channel in a log; BLF and ASC files number the channels."""
+    """Return the bus name of each channel in a log; in BLF and ASC files, channels are numbered."""
     if path.suffix in (".blf", ".asc"):
         return {str(number): bus.name for number, bus in enumerate(hand.buses)}
     return {channel: bus for bus, channel in channels(hand).items()}

@@ -210,7 +210,7 @@ def test_what_was_stored_is_there_at_the_next_start(
     ("content", "says"),
     [
         ("{", "/patch.json: not a node's memory, or incomplete"),
-        (None, "memory: the content belongs to the patch 'skinnode-10x30-u24"),
+        (None, "memory: the contents belong to the patch 'skinnode-10x30-u24"),
     ],
 )
 def test_a_memory_that_is_of_no_use_is_a_fault(

@@ -163,7 +163,7 @@ def test_keys_of_a_preset_in_a_file(tmp_path: Path) -> None:
         (
             "bad.toml",
             b"upper_m = [[[0.0, 0.0, 1.0]]]",
-            "lower_m: got nothing, allowed: an array of electrodes",
+            "lower_m: got nothing, allowed: an array of electrode positions",
         ),
         (
             "bad.toml",

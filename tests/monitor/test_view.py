@@ -246,7 +246,7 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
     assert "nothing lost" in well
     ill = as_text(lines)
     assert "nothing happened" not in ill
-    assert "no event yet; earlier faults: p0 faulty" in ill
+    assert "no events yet; earlier faults: p0 faulty" in ill
     assert "nothing lost" not in ill
     (told,) = [segment for line in lines for segment in line if re.match(r"\d+ chunks? lost", segment.text)][
         :1

@@ -163,7 +163,7 @@ def test_npz_and_parquet_hold_the_same(recorded: Path, tmp_path: Path) -> None:
     convert(recorded, tmp_path / "x.npz")
     convert(tmp_path / "x.parquet", tmp_path / "y.npz")
     there = convert(tmp_path / "x.npz", tmp_path / "z.parquet")
-    assert there.notes == ("x.npz contains no contacts and faults",)
+    assert there.notes == ("x.npz contains no contacts or faults",)
     with np.load(tmp_path / "x.npz") as x, np.load(tmp_path / "y.npz") as y:
         assert x.files == y.files
         for name in x.files:
@@ -200,7 +200,7 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(recorded: Path,
         (
             tmp_path / "x.npz",
             "y.mcap",
-            "allowed: a file ending in .parquet or .npz; a table of fields contains",
+            "allowed: a file ending in .parquet or .npz; a field table contains",
         ),
         (recorded, "y.txt", "allowed: a file ending in .log, .blf, .asc, .mcap, .parquet or .npz"),
         (recorded, "x.npz", "allowed: a new file; this one exists and is not overwritten"),

@@ -241,7 +241,7 @@ def test_can_frames_of_a_bag_that_another_program_recorded(tmp_path: Path) -> No
         writer.finish()
     frame = Frame(0x185, bytes(range(1, 9)), 1_000_000_002)
     assert list(McapReader(path)) == [(frame, "can3", False), (frame, "can3", True), (frame, "/other", False)]
-    with pytest.raises(ConfigError, match=r"a recording of skinnode; for other MCAP files .* give --hand"):
+    with pytest.raises(ConfigError, match=r"a skinnode recording; for other MCAP files .* give --hand"):
         replay(path)
 
 

@@ -17,20 +17,20 @@ from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
 """Number of readings averaged for a baseline. The noise of the baseline is then a quarter of the noise of a
-reading, and the relative noise of R/R0 is only 3 % higher than that of R."""
+single reading, and the relative noise of R/R0 is only 3 % higher than that of R."""
 
 
 class Acquisition:
     """Baseline of a patch, and the codes of its last scan.
 
     Args:
-        profile: sizes of the patch.
-        source: analogue port of the patch.
-        scale: mapping of R/R0 to codes.
-        baseline_ohm: (U, K) initial R0, ohm; None if the patch has no baseline yet.
+        profile: Sizes of the patch.
+        source: Analogue port of the patch.
+        scale: Mapping of R/R0 to codes.
+        baseline_ohm: (U, K) initial R0 in ohms; None if the patch has no baseline yet.
 
     Raises:
-        ValueError: if the baseline has the wrong shape or a negative value.
+        ValueError: If the baseline has the wrong shape or a negative value.
     """
 
     def __init__(
@@ -46,11 +46,11 @@ class Acquisition:
         if (given < 0).any():
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
-        """(U, K) baseline R0 with REAL32 precision, as in the object dictionary, ohm; 0 where unknown."""
+        """(U, K) baseline R0 in ohms with REAL32 precision, as in the object dictionary; 0 where unknown."""
         self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
-        """(U, K) codes of the last scan; all open before the first scan."""
+        """(U, K) codes of the last scan; before the first scan, all are open."""
         self.faults = WireFaults.none(profile)
-        """Wire faults of the last scan."""
+        """Wire faults in the last scan."""
         self.phase = 0
         """Conversion phase of the last scan; 0 if the source does not count its conversions."""
         # conversion count of the source at the last scan
@@ -59,22 +59,22 @@ class Acquisition:
         """Selects the chunks to send in send mode 1 (changed chunks only)."""
 
     def read(self, t_ns: int) -> Float:
-        """Read the source once and return (U, K) resistances, ohm.
+        """Read the source once and return (U, K) resistances in ohms.
 
         Raises:
-            SourceFailed: if the source returns no valid reading.
+            SourceFailed: If the source returns no valid reading.
         """
         return read_source(self._source, (self.profile.rows, self.profile.columns), t_ns)
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
-        """Take a scan: read the source, and encode the mean of the readings.
+        """Take a scan: read the source and encode the mean of the readings.
 
         Args:
-            t_ns: current time, ns.
-            readings: number of readings.
+            t_ns: Current time, ns.
+            readings: Number of readings.
 
         Raises:
-            SourceFailed: if the source returns no valid reading.
+            SourceFailed: If the source returns no valid reading.
         """
         resistance = self._total(t_ns, readings)
         conversions = conversions_of(self._source)
@@ -88,7 +88,7 @@ class Acquisition:
         self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
-        """Return the (U, K) sum of several readings, ohm. ∞ − ∞ gives NaN, which is encoded as open."""
+        """Return the (U, K) sum of several readings in ohms. ∞ − ∞ gives NaN, which is encoded as open."""
         total = self.read(t_ns)
         if readings == 1:
             return total
@@ -103,13 +103,13 @@ class Acquisition:
         Crossings without a valid resistance keep their R0.
 
         Args:
-            t_ns: current time, ns.
-            readings: number of readings to average.
+            t_ns: Current time, ns.
+            readings: Number of readings to average.
 
         Raises:
-            SourceFailed: if the source returns no valid reading.
+            SourceFailed: If the source returns no valid reading.
         """
-        with np.errstate(over="ignore", under="ignore"):  # a resistance beyond REAL32 is invalid
+        with np.errstate(over="ignore", under="ignore"):  # a resistance outside the REAL32 range is invalid
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
@@ -117,13 +117,13 @@ class Acquisition:
         self.selection.forget()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set the R0 of one crossing, ohm. From then on, the node tares only on command."""
+        """Set the R0 of one crossing in ohms. From then on, the node tares only on command."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.selection.forget()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
-        """Set the (U, K) baseline R0, ohm."""
+        """Set the (U, K) baseline R0 in ohms."""
         self.baseline_ohm = values_ohm
         self.tared = True
         self.selection.forget()

@@ -33,7 +33,7 @@ from skinnode.protocol.scan_check import check_of_codes
 from skinnode.protocol.self_test import SELF_TEST_NEVER_RUN, pack_self_test
 from skinnode.protocol.summary import SummaryFlag, conversion_flags
 
-# integers, which take a tenth of the time of enum flags
+# as integers, which are ten times as fast as enum flags
 _WIRE_FAULT, _SOURCE_FAILED = int(SummaryFlag.WIRE_FAULT), int(SummaryFlag.SOURCE_FAILED)
 _BASELINE_CHANGED, _CHANGED_ONLY = int(SummaryFlag.BASELINE_CHANGED), int(SummaryFlag.CHANGED_ONLY)
 
@@ -42,11 +42,11 @@ class PatchApplication:
     """Application of one patch; implements :class:`~skinnode.node.application.Application`.
 
     Args:
-        layout: electrodes of the patch.
-        serial: serial number (0x2000:11), u32.
-        acquisition: source of the codes and the baseline.
-        services: services of the device.
-        pacing: timer precision of the node, which determines how chunks are paced.
+        layout: Electrodes of the patch.
+        serial: Serial number (0x2000:11), u32.
+        acquisition: Source of the codes and the baseline.
+        services: Services of the device.
+        pacing: Timer precision of the node, which determines how chunks are paced.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class PatchApplication:
         self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
         self._operational = False
         self._counter = -1
-        # The codes that the receiver has, and the CRC over them. No code changes in place.
+        # The receiver's codes and their CRC. The array of codes is never modified in place.
         self._checked: Codes | None = None
         self._check = 0
         self._period_ns = 0
@@ -82,8 +82,8 @@ class PatchApplication:
         self.overruns = 0
         """Number of scans skipped because one scan was still being sent and another was waiting."""
         self.slow_overruns = 0
-        """Number of scans skipped because the computer or the bus was too slow, rather than because the scan
-        period is too short."""
+        """Number of scans skipped because the computer or the bus was too slow, not because the scan period
+        is too short."""
         self._scan_ns = NO_DEADLINE_NS  # time of the next timer-driven scan
         describe(services.store, layout, acquisition.scale, serial)
         self._connect()
@@ -97,14 +97,14 @@ class PatchApplication:
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) baseline R0, ohm; 0 where unknown."""
+        """(U, K) baseline R0 in ohms; 0 where unknown."""
         return self._acquisition.baseline_ohm.astype(np.float64)
 
     def power_on(self, t_ns: int) -> None:
-        """Load the baseline from the memory, or tare if there is no baseline at all.
+        """Load the baseline from the memory, or tare if there is no baseline.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         remembered = self._remembered()
         if remembered is not None:
@@ -115,7 +115,7 @@ class PatchApplication:
                 self._storage.keep_baseline()
 
     def reset(self) -> None:
-        """Restart the scan counter. Faults that persist are reported again."""
+        """Restart the scan counter. Persistent faults are reported again."""
         self._counter, self._late = -1, False
         self._wire_faults.reset()
         self._test = SELF_TEST_NEVER_RUN
@@ -132,12 +132,12 @@ class PatchApplication:
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan at a SYNC in OPERATIONAL, unless scans are timer-driven.
+        """Take a scan on a SYNC in OPERATIONAL, unless scans are timer-driven.
 
         Args:
             counter: SYNC counter; None if the SYNC contains no counter.
-            turns: numbers of the synchronous TPDOs that are due.
-            t_ns: arrival time of the SYNC, ns.
+            turns: Numbers of the synchronous TPDOs that are due.
+            t_ns: Arrival time of the SYNC, ns.
         """
         scans = not self._period_ns
         if not scans or self.stream.full:  # this SYNC does not start a scan
@@ -268,7 +268,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # With SYNC counters, a single scan would have the same counter as the scan at the next SYNC.
+                # With SYNC counters, a single scan would have the same counter as the scan for the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

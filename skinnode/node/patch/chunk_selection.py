@@ -1,4 +1,4 @@
-"""Selection of the chunks to send in send mode 1, in which only changed chunks are sent (0x2020:1)."""
+"""Selects the chunks to send in send mode 1 (0x2020:1), in which only changed chunks are sent."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class ChunkSelection:
     """Selects the chunks whose codes have changed since they were last sent.
 
     Args:
-        profile: sizes of the patch.
-        scale: mapping of R/R0 to codes.
+        profile: Sizes of the patch.
+        scale: Mapping of R/R0 to codes.
     """
 
     def __init__(self, profile: PatchProfile, scale: CodeScale) -> None:
@@ -23,23 +23,23 @@ class ChunkSelection:
         self._since_full = 0  # number of scans since the last full scan
         self._full_scan_due = True
         self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
-        """(U, K) codes that were last sent; all open before the first scan."""
+        """(U, K) codes that were last sent; before the first scan, all are open."""
         self._largest_sent: int = scale.open
 
     def forget(self) -> None:
-        """Make the next scan a full scan, because the receiver may not have the codes that were last sent."""
+        """Make the next scan a full scan because the receiver may not have the codes that were last sent."""
         self._full_scan_due = True
 
     def changed_chunks(self, codes: Codes, threshold: int, full_every: int) -> list[int] | None:
-        """Select the chunks to send, and record their codes as sent.
+        """Select the chunks to send and record their codes as sent.
 
         A chunk is selected if one of its codes differs from the last code sent by more than the threshold, or
         if it differs at all and either code is reserved.
 
         Args:
             codes: (U, K) codes of the scan.
-            threshold: largest change in a code that is not sent.
-            full_every: interval between full scans, scans; 0 for no regular full scans.
+            threshold: Largest code change that is not sent.
+            full_every: Interval between full scans, in scans; 0 for no regular full scans.
 
         Returns:
             Numbers of the chunks in ascending order, or None if a full scan is due.
@@ -52,7 +52,7 @@ class ChunkSelection:
         apart = np.abs(np.subtract(codes, self.sent, dtype=np.int64))
         largest = int(np.maximum.reduce(apart, axis=None))
         if largest <= threshold and self._largest_sent + largest <= self._steps:
-            return []  # as in nearly every scan at rest
+            return []  # the usual case while the skin is at rest
         moved = apart > threshold
         moved |= ((codes > self._steps) | (self.sent > self._steps)) & (codes != self.sent)
         chunks = np.zeros(self._n_chunks, dtype=np.bool_)

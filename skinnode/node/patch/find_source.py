@@ -25,10 +25,10 @@ def load(reference: str, option: str) -> Any:
 
     Args:
         reference: ``MODULE:NAME``.
-        option: name of the option for the error message.
+        option: Name of the option for the error message.
 
     Raises:
-        ConfigError: if the module cannot be imported or does not contain the name.
+        ConfigError: If the module cannot be imported or does not contain the name.
     """
     module, _, name = reference.partition(":")
     try:
@@ -41,16 +41,16 @@ def load(reference: str, option: str) -> Any:
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """Create the source of a patch, and read it once to detect faults before the node starts.
+    """Create the source of a patch and read it once to detect faults before the node starts.
 
     Args:
-        name: entry point or ``MODULE:NAME`` of a class or function that takes the layout and returns a
+        name: Entry point or ``MODULE:NAME`` of a class or function that takes the layout and returns a
             :class:`~skinnode.node.patch.source.ResistanceSource`.
-        layout: electrodes of the patch.
-        option: name of the option for the error message.
+        layout: Electrodes of the patch.
+        option: Name of the option for the error message.
 
     Raises:
-        ConfigError: if the source is not found, cannot be created or returns no valid reading.
+        ConfigError: If the source is not found, cannot be created or returns no valid reading.
     """
     points = registered()
     if ":" in name:

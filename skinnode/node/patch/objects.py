@@ -23,10 +23,10 @@ def describe(store: ObjectStore, layout: PatchLayout, scale: CodeScale, serial: 
     """Set the patch descriptor (0x2000) and the electrode coordinates (0x2300).
 
     Args:
-        store: object dictionary.
-        layout: electrodes of the patch.
-        scale: mapping of R/R0 to codes.
-        serial: serial number, u32.
+        store: Object dictionary.
+        layout: Electrodes of the patch.
+        scale: Mapping of R/R0 to codes.
+        serial: Serial number, u32.
     """
     put = store.put
     put(od.DESCRIPTOR, od.CODE_LO, scale.lo)
@@ -42,9 +42,9 @@ def bind_scan(store: ObjectStore, acquisition: Acquisition, stream: ScanStream) 
     """Bind the objects of the last scan: chunk, summary, wire faults and codes.
 
     Args:
-        store: object dictionary.
-        acquisition: provides the codes and wire faults.
-        stream: provides the last chunk and summary.
+        store: Object dictionary.
+        acquisition: Provides the codes and wire faults.
+        stream: Provides the last chunk and summary.
     """
     chunk, summary = fields_of(store, od.CHUNK), fields_of(store, od.SUMMARY)
     store.bind(od.CHUNK, lambda sub: stream.chunk[chunk[sub]])
@@ -61,10 +61,10 @@ def bind_baseline(
     """Bind the objects of the baseline (0x2200 and above, 0x2301).
 
     Args:
-        store: object dictionary.
-        acquisition: contains the baseline.
-        changed: callback for a write of the R0 of one crossing.
-        replaced: callback for a write of the whole baseline.
+        store: Object dictionary.
+        acquisition: Contains the baseline.
+        changed: Callback for a write to the R0 of one crossing.
+        replaced: Callback for a write to the whole baseline.
     """
     profile = acquisition.profile
     for row in range(profile.rows):
@@ -84,11 +84,11 @@ def bind_baseline(
 
 
 def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
-    """Return the slice of each sub-index within the concatenated bytes of a record.
+    """Return each sub-index's slice of the concatenated bytes of a record.
 
     Args:
-        store: object dictionary.
-        index: index of the record.
+        store: Object dictionary.
+        index: Index of the record.
     """
     fields, at = {}, 0
     for subindex in range(1, store.integer(index) + 1):
@@ -120,7 +120,7 @@ def _bind_baseline_row(
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
-    """Return the bit mask of 32 wires at a sub-index: open wires if odd, shorted wires if even."""
+    """Return the 32-wire bit mask at a sub-index: open wires if it is odd, shorted wires if it is even."""
     first = (subindex - 1) // 2 * 32
     bits = masks[(subindex - 1) % 2][first : first + 32]
     return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")

@@ -1,4 +1,4 @@
-"""CANopen node of a patch: the device of :mod:`skinnode.node.device` with the application of a patch."""
+"""CANopen node of a patch: a :mod:`skinnode.node.device` that runs the patch application."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):
-    """CANopen node of one patch. It is silent until :meth:`power_on`.
+    """CANopen node of one patch. It is silent until :meth:`power_on` is called.
 
     Args:
         node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
             memory takes precedence.
-        layout: electrodes of the patch, which determine the sizes of the object dictionary.
-        source: analogue port of the patch.
-        send: function that sends a frame, given its COB-ID and payload.
-        profile: wire format of the patch; by default, 16-bit codes on classic CAN.
-        serial: serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
+        layout: Electrodes of the patch, which determine the sizes of the object dictionary.
+        source: Analogue port of the patch.
+        send: Function that sends a frame, given its COB-ID and payload.
+        profile: Wire format of the patch; by default, 16-bit codes on classic CAN.
+        serial: Serial number (0x1018:4 and 0x2000:11), u32.
+        baseline_ohm: (U, K) initial R0 in ohms; None to tare at the first power-on. A baseline in the memory
             takes precedence.
         pacing: :data:`~skinnode.node.pacing.EXACT` for a node on its own board,
             :data:`~skinnode.node.pacing.THRIFTY` for many nodes on one computer.
-        memory: non-volatile memory for the parameters, baseline and LSS configuration, or None.
-        set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
+        memory: Non-volatile memory for the parameters, baseline and LSS configuration, or None.
+        set_bit_rate: Function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:
-        ValueError: if an argument is out of range.
-        ConfigError: if the layout does not fit the wire format.
+        ValueError: If an argument is out of range.
+        ConfigError: If the wire format cannot represent the layout.
     """
 
     def __init__(  # noqa: PLR0913 - public keywords, one for each part that a board brings
@@ -83,7 +83,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) baseline R0, ohm; 0 where unknown."""
+        """(U, K) baseline R0 in ohms; 0 where unknown."""
         return self._patch.baseline_ohm
 
     @property

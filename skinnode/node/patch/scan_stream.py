@@ -1,26 +1,27 @@
 """Sends scans through the TPDOs of a node: first the chunks, then the summary.
 
-Chunks are sent in the first TPDO whose first mapped object is 0x2010 and which is event-driven or due at the
-SYNC that starts the scan. The summary is sent in every TPDO whose first mapped object is 0x2011. If such
-a TPDO is event-driven, or was due at the SYNC that started the scan, it follows directly after the chunks.
+Chunks are sent in the first TPDO whose first mapped object is 0x2010 and that is event-driven or due at the
+SYNC that starts the scan. The summary is sent in every TPDO whose first mapped object is 0x2011. If such a
+TPDO is event-driven, or was due at the SYNC that started the scan, it immediately follows the chunks.
 Otherwise, it is sent at the next SYNC at which it is due. The end of a scan also triggers all event-driven
 TPDOs that contain other objects.
 
 **Pacing.** CiA 301 defines the inhibit time as a minimum interval between frames. Under a general-purpose
-operating system, threads wake up late, and with a strict minimum interval, a scan could take longer than the
-SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary by sending
+operating system, threads can wake up late, so with a strict minimum interval, a scan could take longer than
+the SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary by sending
 several frames at once. The mean frame rate stays within the limit set by the inhibit time (generic cell rate
-algorithm, ITU-T I.371). With ``catch_up_ns`` 0, the minimum interval is strict.
+algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
 
 The node has no clock to measure how long it takes to read the resistances after a SYNC. The stream therefore
-requests a timer event directly after the first chunk, and paces the second chunk from the time of this event.
+requests a timer event immediately after the first chunk and paces the second chunk from the time of that
+event.
 
 **Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs are discarded if they are still
 unsent when the window closes. Event-driven TPDOs are not affected.
 
 **Queue.** While a scan is being sent, one other scan can wait. Chunks of two scans are never interleaved. If
-the node leaves OPERATIONAL, all scans are dropped without a summary. If the chunk TPDO is disabled, the
-summary states that chunks are missing.
+the node leaves OPERATIONAL, all scans are dropped without a summary. If the chunk TPDO is disabled,
+the summary states that chunks are missing.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Fraction of the sending time that delays must exceed before a slow computer or bus is blamed for a skipped
-scan. Delays due to normal scheduling jitter are shorter."""
+"""Fraction of the sending time that delays must exceed for a skipped scan to be blamed on a slow computer or
+bus. Delays due to normal scheduling jitter are shorter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ class OutgoingScan:
     flags: int
     """Bits of :class:`~skinnode.protocol.summary.SummaryFlag`."""
     device_time_us: int
-    """Time of the scan on the node's clock, µs, modulo 2³²."""
+    """Time of the scan on the node's clock in µs, modulo 2³²."""
     check_of_codes: int | None = None
     """CRC over the codes that the receiver will have after this scan; None for a summary without a check."""
     turns: frozenset[int] = frozenset()
@@ -63,10 +64,10 @@ class ScanStream:
     """Sends the scans of a patch.
 
     Args:
-        store: object dictionary.
+        store: Object dictionary.
         tpdos: TPDO engine of the node.
-        chunk: initial content of the chunk record (0x2010).
-        catch_up_ns: maximum delay that is made up by sending the following chunks sooner, ns.
+        chunk: Initial contents of the chunk record (0x2010).
+        catch_up_ns: Maximum delay, in ns, that the stream makes up by sending later chunks sooner.
     """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
@@ -76,15 +77,15 @@ class ScanStream:
         self._next_scan: OutgoingScan | None = None
         self._carrier: Tpdo | None = None  # TPDO of the current scan's chunks
         self._unsent: deque[bytes] = deque()
-        self._verbatim = False  # whether the carrier maps exactly the chunk record
+        self._verbatim = False  # whether the carrier's mapping is exactly the chunk record
         self._chunks_sent = 0
-        self._busy_ns = 0  # time at which the stream last started to send after being idle
+        self._busy_ns = 0  # time at which the stream last started sending after being idle
         self._just_begun = False
         self._paced_ns = 0  # sum of all inhibit times since _busy_ns
         self.chunk = chunk
-        """Content of the chunk record (0x2010): the last chunk sent."""
+        """Contents of the chunk record (0x2010): the last chunk sent."""
         self.summary = bytes(12)
-        """Content of the summary record (0x2011): the summary of the last scan."""
+        """Contents of the summary record (0x2011): the summary of the last scan."""
         self.scans_sent = 0
         """Number of scans sent completely."""
         tpdos.claim(od.CHUNK, self)
@@ -130,7 +131,7 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """Drop all scans without a summary, because the node leaves OPERATIONAL."""
+        """Drop all scans without a summary because the node is leaving OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
@@ -144,8 +145,8 @@ class ScanStream:
         """Send a scan, immediately or after the current scan. :attr:`full` must be false.
 
         Args:
-            scan: scan to send.
-            t_ns: current time, ns.
+            scan: Scan to send.
+            t_ns: Current time, ns.
         """
         if self._scan is None:
             self._busy_ns, self._paced_ns = t_ns, 0
@@ -182,7 +183,7 @@ class ScanStream:
                 self._verbatim = bool(scan.chunks) and self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # no burst of chunks after a pause
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # prevents a burst of chunks after a pause
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:
@@ -203,7 +204,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # only now: the bus may have refused the chunk
+            self._chunks_sent += 1  # counted only now, because the bus may have refused the chunk
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

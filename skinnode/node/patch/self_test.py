@@ -25,8 +25,8 @@ The relative standard error of the noise estimate is 1/√30 = 18 % for one cros
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Maximum relative noise of a reading; above it, the self-test fails. The accuracy of the solver is specified
-for a hundredth of this noise."""
+"""Maximum relative noise of a reading that passes the self-test. The accuracy of the solver is specified for
+one hundredth of this noise."""
 
 
 @np.errstate(over="ignore", invalid="ignore")  # only absurdly large resistances overflow
@@ -34,9 +34,9 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
     """Run a self-test.
 
     Args:
-        read: function that returns (U, K) resistances, ohm, or raises SourceFailed.
-        baseline_ohm: (U, K) R0, ohm.
-        scale: mapping of R/R0 to codes.
+        read: Function that returns (U, K) resistances in ohms or raises SourceFailed.
+        baseline_ohm: (U, K) R0 in ohms.
+        scale: Mapping of R/R0 to codes.
 
     Returns:
         Findings of the self-test.
@@ -75,7 +75,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the RMS, over all crossings, of the standard deviation divided by the mean."""
+    """Return the RMS, over all crossings, of the relative standard deviation."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

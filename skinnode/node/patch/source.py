@@ -1,4 +1,4 @@
-"""Analogue port of a patch: interface of a resistance source, such as a converter or the simulator."""
+"""Analogue port of a patch: interface to a resistance source, such as a converter or the simulator."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from skinnode.model.layout import Float, require_array
 class ResistanceSource(Protocol):
     """Source of the resistances between the upper and the lower wires of a patch.
 
-    A source may also have an integer attribute ``conversions``: the number of times that the converter has
-    measured all crossings. The node reads it after :meth:`read`, and states in the summary whether it has
-    changed. The host can then detect a stopped converter immediately. If the attribute is missing or None,
-    the host must rely on the codes to detect a stopped converter.
+    A source can also have an integer attribute ``conversions``: the number of times that the converter has
+    measured all crossings. The node reads it after calling :meth:`read` and states in the summary whether it
+    has changed. The host can then detect a stopped converter immediately. If the attribute is missing or
+    None, the host must rely on the codes to detect a stopped converter.
 
-    The converter itself must count the conversions, not :meth:`read`, and it must measure all crossings at
-    least once per scan. Otherwise, the source must not have this attribute.
+    The conversions must be counted by the converter itself, not by :meth:`read`, and the converter must
+    measure all crossings at least once per scan. Otherwise, the source must not have this attribute.
     """
 
     def read(self, t_ns: int) -> Float:
-        """Return (U, K) resistances, ohm; infinite for an open crossing, 0 for a shorted crossing.
+        """Return (U, K) resistances in ohms; infinite for an open crossing, 0 for a shorted crossing.
 
         The node copies the array. If this method raises an exception, the node reports a source failure and
         tries again at the next scan.
 
         Args:
-            t_ns: current time on the monotonic clock, ns.
+            t_ns: Current time on the monotonic clock, ns.
         """
         ...
 
@@ -37,7 +37,7 @@ def conversions_of(source: ResistanceSource) -> int | None:
     """Return the number of conversions of a source, or None if the source does not count them.
 
     Raises:
-        SourceFailed: if the attribute raises an exception or is not an integer.
+        SourceFailed: If the attribute raises an exception or is not an integer.
     """
     try:
         count = getattr(source, "conversions", None)
@@ -69,15 +69,15 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
     """Read a source and check the reading.
 
     Args:
-        source: source to read.
-        shape: shape of the reading, (U, K).
-        t_ns: current time, ns.
+        source: Source to read.
+        shape: Shape of the reading, (U, K).
+        t_ns: Current time, ns.
 
     Returns:
-        Copy of the (U, K) resistances, ohm, as float64.
+        Copy of the resistances in ohms, (U, K) float64.
 
     Raises:
-        SourceFailed: if the source raises an exception, or does not return an array of numbers with the
+        SourceFailed: If the source raises an exception or does not return an array of numbers with the
             required shape. The message is a single line.
     """
     try:

@@ -1,4 +1,4 @@
-"""Monitoring of the source of a patch; failures are reported with EMCY 0xFF00."""
+"""Monitors the source of a patch and reports failures with EMCY 0xFF00."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class SourceMonitor:
 
     Args:
         emcy: EMCY producer of the node.
-        on_failure: callback for each failure.
+        on_failure: Callback for each failure.
     """
 
     def __init__(self, emcy: EmcyProducer, on_failure: Callable[[], None]) -> None:
@@ -28,7 +28,7 @@ class SourceMonitor:
         """One-line description of the latest failure; empty if there has been none."""
 
     def reset(self, t_ns: int) -> None:
-        """Report the current failure again after a reset, if any."""
+        """Report the current failure, if any, again after a reset."""
         if self._fault is not None:
             self._report(self._fault, t_ns)
 
@@ -40,14 +40,14 @@ class SourceMonitor:
         failure is reported.
 
         Args:
-            t_ns: current time, ns.
+            t_ns: Current time, ns.
         """
         try:
             yield
         except SourceFailed as failure:
             self.failures += 1
             self.error = str(failure)
-            if failure.fault is not self._fault:  # a lasting failure is reported once
+            if failure.fault is not self._fault:  # a persistent failure is reported once
                 self._report(failure.fault, t_ns)
             self._on_failure()
             raise

@@ -1,4 +1,4 @@
-"""Detection of open and shorted wires from the codes of a scan, reported with EMCY 0x5000."""
+"""Detects open and shorted wires from the codes of a scan and reports them with EMCY 0x5000."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class WireFaults:
 
     @staticmethod
     def none(profile: PatchProfile) -> WireFaults:
-        """Return the value for a patch without wire faults."""
+        """Return a WireFaults object without faults."""
         return _no_faults((profile.rows, profile.columns))
 
     @property
@@ -48,7 +48,7 @@ class WireFaults:
 
 @functools.cache
 def _no_faults(shape: tuple[int, int]) -> WireFaults:
-    """Return the value for a patch with (U, K) wires and no wire faults. Its arrays are read-only."""
+    """Return a WireFaults object without faults for U upper and K lower wires. Its arrays are read-only."""
     upper, lower = (np.zeros(wires, dtype=np.bool_) for wires in shape)
     for mask in (upper, lower):
         mask.flags.writeable = False
@@ -60,9 +60,9 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
     Args:
         codes: (U, K) codes.
-        scale: mapping of R/R0 to codes.
+        scale: Mapping of R/R0 to codes.
     """
-    if codes.max() < scale.short:  # as in nearly every scan
+    if codes.max() < scale.short:  # the usual case
         return _no_faults((codes.shape[0], codes.shape[1]))
     is_open, is_short = codes == scale.open, codes == scale.short
     return WireFaults(is_open.all(axis=1), is_short.all(axis=1), is_open.all(axis=0), is_short.all(axis=0))
@@ -72,7 +72,7 @@ class WireFaultReporter:
     """Sends emergency messages when wire faults begin and end.
 
     Args:
-        profile: sizes of the patch.
+        profile: Sizes of the patch.
         emcy: EMCY producer of the node.
     """
 
@@ -81,18 +81,19 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Forget the reported faults after a reset, so that persisting faults are reported again."""
+        """Forget the reported faults after a reset, so that persistent faults are reported again."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
         """Report new wire faults, or the end of all wire faults.
 
-        Faults that begin in the same scan, as when a connector is unplugged, are reported in one message. It
-        contains the type and wire number of the first new fault, and the number of faulty wires.
+        Faults that begin in the same scan, for example when a connector is unplugged, are reported in one
+        message, which contains the type and wire number of the first new fault, and the number of faulty
+        wires.
 
         Args:
-            faults: current wire faults.
-            t_ns: current time, ns.
+            faults: Current wire faults.
+            t_ns: Current time, ns.
         """
         reported, self._reported = self._reported, faults
         if not faults.any:

@@ -1,6 +1,6 @@
 """Communication and mapping parameters of PDOs (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-Where the standard does not specify an abort code, the abort code is that of the CANopenNode stack.
+Where the standard does not specify an abort code, the code used by the CANopenNode stack is returned.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skinnode.node.object_dictionary import ObjectStore
 
 INVALID_BIT: Final = od.PDO_INVALID
 NO_RTR_BIT: Final = 1 << 30
-"""Bit in the COB-ID of a TPDO: no remote frame allowed on this PDO."""
+"""Bit in a TPDO's COB-ID: remote frames are not allowed for this PDO."""
 EXTENDED_BIT: Final = 1 << 29
 """Bit in a COB-ID: the CAN-ID has 29 bits."""
 COB_ID_MASK: Final = 0x7FF
@@ -23,8 +23,8 @@ COB_ID_MASK: Final = 0x7FF
 SYNC_CYCLIC_MAX: Final = 240
 """Highest cyclic synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types of PDOs that are sent only on request by a remote frame. Their values are those at the
-last SYNC (252) or at the request (253)."""
+"""Transmission types of PDOs that are sent only on request by a remote frame. Their values are sampled at the
+last SYNC (252) or on request (253)."""
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 
@@ -48,12 +48,12 @@ def check_cob_id(value: int, current: int) -> None:
     """Check a COB-ID written by a client.
 
     Args:
-        value: new COB-ID, with its flag bits.
-        current: current COB-ID, with its flag bits.
+        value: New COB-ID, with its flag bits.
+        current: Current COB-ID, with its flag bits.
 
     Raises:
-        Refused: if the new COB-ID is malformed, if its CAN-ID is restricted, or if its CAN-ID differs from
-            that of an enabled service.
+        Refused: If the new COB-ID is malformed, if its CAN-ID is restricted, or if it would change the CAN-ID
+            of an enabled service.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
@@ -66,24 +66,24 @@ def check_cob_id(value: int, current: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """Object mapped into a PDO. If ``index`` is that of a data type, it is a dummy without a value."""
+    """Object mapped into a PDO. If ``index`` refers to a data type, the object is a dummy without a value."""
 
     index: int
     subindex: int
     size: int
-    """Length of the object, bytes."""
+    """Length of the object in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Communication and mapping parameters of a PDO. A time of 0 ns means that it is not used."""
+    """Communication and mapping parameters of a PDO. A time of 0 ns means that the time is not used."""
 
     enabled: bool
     """Whether the PDO is enabled and has at least one mapped object."""
     cob_id: int
     """CAN-ID of the PDO, 11 bits."""
     answers_rtr: bool
-    """Whether remote frames may request the PDO; false for an RPDO."""
+    """Whether remote frames can request the PDO; false for an RPDO."""
     kind: int
     """Transmission type."""
     inhibit_ns: int
@@ -92,7 +92,7 @@ class PdoParameters:
     mapping: tuple[Mapped, ...]
     """Mapped objects, in payload order."""
     size: int
-    """Length of the payload, bytes."""
+    """Length of the payload in bytes."""
 
     @property
     def event_driven(self) -> bool:
@@ -109,11 +109,11 @@ class PdoRecords:
     """Communication record and mapping record of a PDO. Writes by clients are checked.
 
     Args:
-        store: object dictionary.
-        parameter: index of the communication record.
-        mapping: index of the mapping record.
-        transmits: whether the PDO is a TPDO.
-        taken: function that returns whether a PDO uses a CAN-ID; None if PDOs may share CAN-IDs.
+        store: Object dictionary.
+        parameter: Index of the communication record.
+        mapping: Index of the mapping record.
+        transmits: Whether the PDO is a TPDO.
+        taken: Function that returns whether a PDO uses a CAN-ID; None if PDOs are allowed to share CAN-IDs.
     """
 
     def __init__(
@@ -198,7 +198,7 @@ class PdoRecords:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Return the length of the object in a mapping entry, bytes."""
+        """Return the length, in bytes, of the object in a mapping entry."""
         index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if not self._transmits and not subindex and index in od.DUMMY_BITS:
             allowed, size = True, od.DUMMY_BITS[index]

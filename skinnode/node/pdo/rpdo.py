@@ -5,8 +5,8 @@
 - Types 254 and 255: applied immediately.
 
 Excess bytes are ignored. An RPDO that is too short is not applied. Length errors are reported in emergency
-messages, but not again while the same error persists. The event timer monitors the reception of an RPDO from
-its first reception in OPERATIONAL.
+messages, but not again while the same error persists. The event timer monitors an RPDO once it has been
+received for the first time in OPERATIONAL.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ class RpdoEngine:
     """Receives the RPDOs of a node.
 
     Args:
-        services: resources that all services of the node share.
-        count: number of RPDOs.
-        window: synchronous window of the node.
+        services: Resources that all services of the node share.
+        count: Number of RPDOs.
+        window: Synchronous window of the node.
     """
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
@@ -69,7 +69,7 @@ class RpdoEngine:
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
         self._pending: dict[int, bytes] = {}  # payloads to apply at the next SYNC, by RPDO number
 
-        # numbers of the RPDOs with an active error: too short, or overdue
+        # numbers of the RPDOs with an active error: too short or overdue
         self._short: set[int] = set()
         self._late: set[int] = set()
         self._rpdos: list[_Rpdo] = []
@@ -89,7 +89,7 @@ class RpdoEngine:
     # --- parameters
 
     def restore(self) -> None:
-        """Apply the parameters of all RPDOs after a reset, and discard all errors."""
+        """Apply the parameters of all RPDOs after a reset and discard all errors."""
         self._by_cob_id.clear()
         self._pending.clear()
         self._timers.clear()
@@ -133,9 +133,9 @@ class RpdoEngine:
         """Handle a frame, which may belong to several RPDOs.
 
         Args:
-            cob_id: identifier of the frame.
-            data: payload of the frame.
-            t_ns: arrival time, ns.
+            cob_id: Identifier of the frame.
+            data: Payload of the frame.
+            t_ns: Arrival time, ns.
         """
         if self._operational:
             for rpdo in tuple(self._by_cob_id.get(cob_id, ())):
@@ -148,7 +148,7 @@ class RpdoEngine:
             self._execute(self._rpdos[number], pending[number])
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each overdue RPDO. Its monitoring restarts when it is received again."""
+        """Report each overdue RPDO. Monitoring restarts when the RPDO is received again."""
         for number in self._timers.take(t_ns):
             self._late.add(number)
             self._emcy.report(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)

@@ -5,18 +5,18 @@ type       sent
 =========  =======================================================================================
 0          after a SYNC, if the values have changed since the last transmission
 1 to 240   after every n-th SYNC, counted from the SYNC start value if one is set
-252        on a remote frame, with the values of the last SYNC; not before the first SYNC
+252        on a remote frame, with the values from the last SYNC; not before the first SYNC
 253        on a remote frame
 254, 255   on an event (:meth:`TpdoEngine.trigger`), when the event timer elapses, and on a remote frame;
            never before the inhibit time has passed
 =========  =======================================================================================
 
-An application can *claim* an object. It then owns all TPDOs whose first mapped object is the claimed object,
+An application can *claim* an object. It then owns all TPDOs whose first mapped object is the claimed object
 and sends them itself: SYNCs and events do not trigger them. The engine still counts SYNCs, answers remote
 frames and runs the event timers of these TPDOs.
 
-The time to handle a SYNC is proportional to the number of enabled TPDOs that SYNCs send or sample. The time
-to handle a timer event is proportional to the number of TPDOs that are due.
+The time to handle a SYNC is proportional to the number of enabled TPDOs that are sent or sampled on SYNCs.
+The time to handle a timer event is proportional to the number of TPDOs that are due.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Tpdo:
     """Parameters and state of one TPDO.
 
     Args:
-        number: number of the TPDO, counted from 0.
-        records: records of the TPDO in the object dictionary.
+        number: Number of the TPDO, counted from 0.
+        records: Records of the TPDO in the object dictionary.
     """
 
     def __init__(self, number: int, records: PdoRecords) -> None:
@@ -80,7 +80,7 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Reset the state and start the event timer, because the node enters OPERATIONAL."""
+        """Reset the state and start the event timer because the node is entering OPERATIONAL."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
@@ -93,8 +93,8 @@ class Tpdo:
     def elapse(self, t_ns: int) -> None:
         """Restart the event timer after it has elapsed.
 
-        The new period begins at the end of the last one. After a delay of a whole period or more, it begins
-        at ``t_ns``.
+        The new period begins at the end of the previous period. After a delay of one period or more, it
+        begins at ``t_ns``.
         """
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
@@ -114,7 +114,7 @@ class Tpdo:
             if counter != parameters.sync_start:
                 return False
             self._in_step, self._syncs = True, 0
-            return True  # the SYNC with the start value is the first
+            return True  # the SYNC with the start value counts as the first
         self._syncs += 1
         if self._syncs < parameters.kind:
             return False
@@ -123,10 +123,10 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """Part of an application that sends the TPDOs with a claimed object."""
+    """Part of an application that sends the TPDOs whose first mapped object it has claimed."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether the owner is about to send this TPDO without being triggered."""
+        """Return whether the owner is about to send this TPDO without a trigger."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
@@ -138,9 +138,9 @@ class TpdoEngine:
     """Sends the TPDOs of a node.
 
     Args:
-        services: resources that all services of the node share.
-        count: number of TPDOs.
-        window: synchronous window of the node.
+        services: Resources that all services of the node share.
+        count: Number of TPDOs.
+        window: Synchronous window of the node.
     """
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
@@ -151,8 +151,8 @@ class TpdoEngine:
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
-        # Numbers of enabled TPDOs, ascending: those that a SYNC sends or samples, those that events send, and
-        # those with an owner.
+        # Numbers of enabled TPDOs in ascending order: TPDOs sent or sampled on a SYNC, TPDOs sent on events,
+        # and TPDOs with an owner.
         self._listening: list[int] = []
         self._eventful: list[int] = []
         self._owned: list[int] = []
@@ -218,14 +218,14 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """Start all TPDOs, because the node enters OPERATIONAL."""
+        """Start all TPDOs because the node is entering OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """Stop all TPDOs, because the node leaves OPERATIONAL."""
+        """Stop all TPDOs because the node is leaving OPERATIONAL."""
         self._running = False
         self._timers.clear()
 
@@ -246,11 +246,11 @@ class TpdoEngine:
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
         """Send the synchronous TPDOs that are due, and sample the TPDOs of type 252.
 
-        The application must have handled the SYNC before.
+        The application must already have handled the SYNC.
 
         Args:
-            turns: numbers of the synchronous TPDOs that are due.
-            t_ns: arrival time of the SYNC, ns.
+            turns: Numbers of the synchronous TPDOs that are due.
+            t_ns: Arrival time of the SYNC, ns.
         """
         for number in tuple(self._listening):
             tpdo = self._tpdos[number]
@@ -272,7 +272,7 @@ class TpdoEngine:
         self._let_out(tpdo, t_ns)
 
     def on_remote(self, cob_id: int, t_ns: int) -> None:
-        """Send the TPDO that a remote frame requests. Synchronous TPDOs ignore it (CiA 301, 7.2.2.3)."""
+        """Send the TPDO requested by a remote frame. Synchronous TPDOs ignore it (CiA 301, 7.2.2.3)."""
         tpdo = self._by_cob_id.get(cob_id)
         if tpdo is None or not tpdo.parameters.answers_rtr or self._sent_anyway(tpdo):
             return
@@ -301,12 +301,12 @@ class TpdoEngine:
     # --- sending
 
     def payload(self, tpdo: Tpdo) -> bytes:
-        """Return the current values of the objects mapped into a TPDO."""
+        """Return the payload of a TPDO: the current values of its mapped objects."""
         raw = self._store.raw
         return b"".join([raw(each.index, each.subindex) for each in tpdo.parameters.mapping])
 
     def emit(self, tpdo: Tpdo, payload: bytes) -> None:
-        """Send a payload immediately, without regard to the inhibit time; used by owners."""
+        """Send a payload immediately, regardless of the inhibit time; used by owners."""
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
@@ -337,7 +337,7 @@ class TpdoEngine:
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Add ``number`` to the sorted list ``numbers`` if ``wanted``, else remove it."""
+    """Add ``number`` to the sorted list ``numbers`` if ``wanted`` is true; otherwise remove it."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

@@ -1,8 +1,8 @@
-"""SDO block transfers (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15), in which a block is acknowledged as a whole.
+"""SDO block transfers (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15), with one acknowledgement per block.
 
 CAN delivers a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1).
-Acknowledgements contain no block number, so a duplicate would be taken for the acknowledgement of the next
-block, and segments would be skipped. A frame identical to the previous one is therefore ignored, unless the
+Acknowledgements contain no block number, so a duplicate would be mistaken for the acknowledgement of the next
+block, and segments would be skipped. A frame identical to the previous frame is therefore ignored, unless the
 protocol allows two identical frames in succession.
 """
 
@@ -20,23 +20,23 @@ from skinnode.errors import BusError
 from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 SEGMENT_NS: Final = 500_000
-"""Initial mean interval between segments, ns.
+"""Initial mean interval between segments, in ns.
 
-The rate of 2000 frames/s is below the 2200 frames/s that remain on a 1 Mbit/s bus with 70 % PDO load, so the
-transmit queue does not fill up. A block of 127 segments takes 64 ms, which is well within the time-outs of
-clients (the canopen library waits 300 ms). Whenever the bus refuses a segment, for example at a lower bit
+The resulting rate of 2000 frames/s is below the 2200 frames/s available on a 1 Mbit/s bus with 70 % PDO load,
+so the transmit queue does not fill up. A block of 127 segments takes 64 ms, which is well within client
+time-outs (the canopen library waits 300 ms). Whenever the bus refuses a segment, for example at a lower bit
 rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean interval between segments, ns. At this interval, segments use a quarter of the capacity of a
-125 kbit/s bus."""
+"""Maximum mean interval between segments, in ns. At this interval, segments use a quarter of the capacity of
+a 125 kbit/s bus."""
 SEGMENTS_AT_ONCE: Final = 4
 """Maximum number of segments sent at once after the thread has woken up late.
 
-Two bursts in quick succession must fit into the transmit queue, which holds 10 frames on Linux.
+Two bursts in quick succession must fit in the transmit queue, which holds 10 frames on Linux.
 """
 TWICE_NS: Final = 3_000_000
-"""Maximum time between a frame and its duplicate, ns: the duration of two frames of maximum length and an
+"""Maximum time in ns between a frame and its duplicate: the duration of two maximum-length frames and an
 error frame at 125 kbit/s.
 """
 
@@ -71,7 +71,7 @@ class Upload:
     data: bytes
     """Value of the object."""
     block_size: int
-    """Number of segments in the first block. Each acknowledgement contains that of the next block."""
+    """Number of segments in the first block. Each acknowledgement contains the number for the next block."""
     crc: bool
     """Whether the client supports a CRC."""
 
@@ -81,27 +81,27 @@ class BlockUpload(Transfer):
 
     Args:
         channel: SDO server channel.
-        target: object to read.
-        upload: value and options.
-        t_ns: arrival time of the initiate request, ns.
+        target: Object to read.
+        upload: Value and options.
+        t_ns: Arrival time of the initiate request, ns.
 
     Raises:
-        Refused: if the block size is not from 1 to 127.
+        Refused: If the block size is not in the range 1 to 127.
     """
 
     def __init__(self, channel: Channel, target: Target, upload: Upload, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)
         data, crc = upload.data, upload.crc
         self._data, self._crc = data, crc
-        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value needs one segment, too
+        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # even an empty value needs one segment
         self._block_size = _checked(upload.block_size)
         self._first = 0  # number of segments before the current block
         self._pace_ns = SEGMENT_NS
         self._sent = 0  # number of segments sent in the current block
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
-        # Offer a CRC only if the client supports it: some clients expect the CRC that a server offers, even
-        # if they have not requested one.
+        # Offer a CRC only if the client supports it: if the server offers a CRC, some clients expect it even
+        # if they have not requested it.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
@@ -157,7 +157,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """Continue after the first ``received`` segments of the block, which have reached the client."""
+        """Continue after the first ``received`` segments of the block, which the client has received."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)
@@ -175,18 +175,18 @@ class BlockUpload(Transfer):
 class BlockDownload(Transfer):
     """Block download. The constructor sends the response to the initiate request.
 
-    At the end of a block, the server acknowledges the segments before the first lost one. If the last segment
-    of a block is lost, the transfer times out.
+    At the end of a block, the server acknowledges the segments before the first lost segment. If the last
+    segment of a block is lost, the transfer times out.
 
     Args:
         channel: SDO server channel.
-        target: object to write.
-        announced: size announced by the client, bytes, or None.
-        t_ns: arrival time of the initiate request, ns.
-        crc: whether the client supports a CRC.
+        target: Object to write.
+        announced: Size in bytes announced by the client, or None.
+        t_ns: Arrival time of the initiate request, ns.
+        crc: Whether the client supports a CRC.
 
     Raises:
-        Refused: if the object is not writable, or does not accept the announced size.
+        Refused: If the object is not writable or rejects the announced size.
     """
 
     def __init__(
@@ -195,10 +195,10 @@ class BlockDownload(Transfer):
         super().__init__(channel, target, t_ns)
         self._incoming = Incoming(channel.store, target, announced)
         self._crc = crc
-        self._received = 0  # number of segments of the current block before the first lost one
-        # last segment of the transfer; the end request tells how many of its bytes are data
+        self._received = 0  # number of segments before the first lost segment in the current block
+        # last segment of the transfer; the end request states how many of its bytes are data
         self._last: bytes | None = None
-        self._previous = b""  # last segment of the acknowledged block, to recognise a duplicate
+        self._previous = b""  # last segment of the acknowledged block, used to recognise a duplicate
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:

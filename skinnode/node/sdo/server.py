@@ -1,7 +1,7 @@
-"""SDO server (CiA 301 v4.2, 7.2.4.3), with expedited and segmented transfers.
+"""SDO server (CiA 301 v4.2, 7.2.4.3) for expedited and segmented transfers.
 
 Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is no
-substitute: it does not reject unknown commands, and has neither a time-out nor block transfers.
+substitute: it does not reject unknown commands and supports neither time-outs nor block transfers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Maximum time (ns) to wait for the next request of a client before the transfer is aborted. CiA 301 does not
+"""Maximum time (ns) to wait for a client's next request before the transfer is aborted. CiA 301 does not
 specify this time-out."""
 
 _TOGGLE: Final = 0x10
@@ -42,13 +42,13 @@ _NAMELESS: Final = (0, 3, 5, 6)
 class SdoServer:
     """SDO server with one channel, which performs one transfer at a time.
 
-    An initiate request replaces an unfinished transfer, which the client must have abandoned. An exception
-    from ``send`` propagates to the caller and does not end the transfer.
+    An initiate request replaces an unfinished transfer, which the client has evidently abandoned. An
+    exception from ``send`` propagates to the caller and does not end the transfer.
 
     Args:
-        store: object dictionary.
-        send: function that sends a response of eight bytes.
-        timeout_ns: maximum time to wait for the next request of a client, ns.
+        store: Object dictionary.
+        send: Function that sends a response of eight bytes.
+        timeout_ns: Maximum time to wait for a client's next request, ns.
     """
 
     def __init__(
@@ -79,8 +79,8 @@ class SdoServer:
         """Handle a request.
 
         Args:
-            request: payload of eight bytes.
-            t_ns: arrival time, ns.
+            request: Payload of eight bytes.
+            t_ns: Arrival time, ns.
         """
         transfer = self._transfer
         if request[0] == ABORT:
@@ -138,7 +138,7 @@ class SdoServer:
     def _block_upload(self, request: bytes, target: Target, t_ns: int) -> None:
         data = self._read(target)
         block_size, switch_threshold, crc = request[4], request[5], bool(request[0] & 4)
-        # Up to the protocol switch threshold, the client prefers a normal upload.
+        # For values up to the protocol switch threshold, the client prefers a normal upload.
         if 0 < len(data) <= switch_threshold:
             self._start_upload(target, data, t_ns)
         else:
@@ -152,7 +152,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # If the request states no size, the size is that of the object, up to four bytes.
+        # If the request states no size, the object's size is used, up to four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])

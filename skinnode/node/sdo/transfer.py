@@ -26,7 +26,7 @@ class Channel:
     send: Callable[[bytes], None]
     """Function that sends a response of eight bytes."""
     timeout_ns: int
-    """Maximum time (ns) to wait for the next request of a client."""
+    """Maximum time (ns) to wait for a client's next request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +40,12 @@ class Target:
 
 
 class Transfer(ABC):
-    """Transfer that takes several requests. Its methods raise Refused to abort it.
+    """Transfer that requires several requests. Its methods raise Refused to abort it.
 
     Args:
         channel: SDO server channel.
-        target: object to read or write.
-        t_ns: arrival time of the initiate request, ns.
+        target: Object to read or write.
+        t_ns: Arrival time of the initiate request, ns.
     """
 
     def __init__(self, channel: Channel, target: Target, t_ns: int) -> None:
@@ -64,10 +64,10 @@ class Transfer(ABC):
         """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
 
     def on_timer(self, t_ns: int) -> None:
-        """Abort the transfer, because it has timed out. Overridden if the transfer has other timer events.
+        """Abort the transfer because it has timed out. Overridden if the transfer has other timer events.
 
         Raises:
-            Refused: always.
+            Refused: Always.
         """
         raise Refused(AbortCode.TIMED_OUT)
 
@@ -79,12 +79,12 @@ class Incoming:
     """Value of a download, received in parts and then written to the object as a whole.
 
     Args:
-        store: object dictionary.
-        target: object to read or write.
-        announced: size announced by the client, bytes, or None.
+        store: Object dictionary.
+        target: Object to read or write.
+        announced: Size in bytes announced by the client, or None.
 
     Raises:
-        Refused: if the object is not writable, or does not accept the announced size.
+        Refused: If the object is not writable or rejects the announced size.
     """
 
     def __init__(self, store: ObjectStore, target: Target, announced: int | None) -> None:
@@ -100,7 +100,7 @@ class Incoming:
         """Append a part of the value.
 
         Raises:
-            Refused: if the value is too long.
+            Refused: If the value is too long.
         """
         self.data += part
         self._lengths.check_not_above(len(self.data))
@@ -111,7 +111,7 @@ class Incoming:
         """Write the complete value to the object.
 
         Raises:
-            Refused: if the value is too short, or the object does not accept it.
+            Refused: If the value is too short or the object rejects it.
         """
         if self._announced is not None and len(self.data) < self._announced:
             raise Refused(AbortCode.TOO_SHORT)

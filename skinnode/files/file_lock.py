@@ -1,4 +1,4 @@
-"""Lock files that contain the process ID of the owner and never become stale."""
+"""Lock files that contain their owner's process ID and never become stale."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from typing import Final
 
 _TRIES: Final = 100
 """Maximum number of attempts to lock a file. An attempt fails if the previous owner removes the file during
-the attempt."""
+the attempt.
+"""
 
 
 class FileInUse(BlockingIOError):
-    """Raised if the lock is held; ``process`` is the process ID of the owner, None if unknown."""
+    """Raised if the lock is held; ``process`` is the owner's process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -47,7 +48,7 @@ class FileLock:
     def release(self) -> None:
         """Release the lock, and remove the file if this process created the lock. Call it only once.
 
-        The lock persists as long as a forked child that inherited it is running.
+        The lock persists while a forked child that inherited it is running.
         """
         if self.process == os.getpid():
             with contextlib.suppress(OSError):

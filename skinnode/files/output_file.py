@@ -11,7 +11,7 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written, before its content is computed.
+    """Check that a file can be written, before computing its content.
 
     Args:
         option: Option that specifies the file, for error messages.

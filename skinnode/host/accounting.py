@@ -45,7 +45,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss or error counter of a bus, by counter name."""
+    """Return a phrase for each of a bus's nonzero loss and error counters, keyed by counter name."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -57,7 +57,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss counter of a patch, by counter name."""
+    """Return a phrase for each of a patch's nonzero loss counters, keyed by counter name."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),

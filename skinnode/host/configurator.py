@@ -39,7 +39,7 @@ total.
 """
 
 HEARTBEATS_WATCHED: Final = 3
-"""Time without a heartbeat from the host after which a node stops sending scans, in heartbeat periods."""
+"""Number of heartbeat periods without a host heartbeat after which a node stops sending scans."""
 
 _POLL_S: Final = 0.02
 
@@ -252,7 +252,7 @@ class Configurator:
         deadline.
 
         Returns:
-            (U, K) resistances at rest, ohm.
+            (U, K) resistances at rest, in ohms.
 
         Raises:
             NodeError: if the node does not keep the written baseline, or a resistance is not positive.
@@ -282,10 +282,10 @@ class Configurator:
         return baseline
 
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Read the baseline by block transfer, or value by value from a node without block transfer.
+        """Read the baseline by block transfer, or value by value if the node does not support block transfer.
 
         At 1 Mbit/s, a block transfer of 300 values takes 176 frames and 86 ms, limited by the rate at which
-        the node sends segments. Single reads take 600 frames and 75 ms plus the response times of the node.
+        the node sends segments. Single reads take 600 frames and 75 ms, plus the node's response times.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -315,7 +315,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
     reconfigures the node.
 
     Returns:
-        True if the node's values are those that the host would write.
+        True if the node's values are the ones that the host would write.
 
     Raises:
         NodeError: if reading fails; see :class:`RemoteOd`.
@@ -341,7 +341,7 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Make the node monitor the host's heartbeat through entry 1 of object 0x1016.
+    """Make the node monitor the host's heartbeat, using entry 1 of object 0x1016.
 
     Two entries must not contain the same node-ID, so any other entry with the host's node-ID is cleared. The
     remaining entries are left unchanged.

@@ -1,8 +1,8 @@
 """Contain exceptions in the threads of the host.
 
-An exception that concerns one patch, bus or subscriber does not affect the others, and the failed operation
-is retried. Each patch and each bus has its own record of exceptions, :class:`Defects`. The table in
-:mod:`skinnode.host` lists the effect of an exception in each thread.
+An exception in one patch, bus or subscriber does not affect the others, and the failed operation is retried.
+Each patch and each bus has its own record of exceptions, :class:`Defects`. The table in :mod:`skinnode.host`
+lists the effect of an exception in each thread.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class DefectStats:
 
 
 class Defects:
-    """Record of the exceptions that concern ``subject``, such as a patch or a bus. Thread-safe.
+    """Record of the exceptions for one ``subject``, such as a patch or a bus. Thread-safe.
 
     An exception with a new message is logged on one line at level WARNING, logged with its traceback at level
     DEBUG, and passed to ``on_new``.

@@ -1,6 +1,6 @@
-"""Count the frames of a bus and dispatch them to handlers by COB-ID, without threads or a clock.
+"""Count a bus's frames and dispatch them to handlers by COB-ID, without threads or a clock.
 
-A host feeds the dispatcher through a :class:`~skinnode.host.link.BusLink`, a replay from a recording.
+In a host, a :class:`~skinnode.host.link.BusLink` feeds the dispatcher; in a replay, a recording does.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MARKS: Final = 10
 """Length of the moving average of the bus load, in units of ``_MARK_NS``."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval (ns) between calls of the pollers. Their shortest timeout is 5 ms, so polling after each
+"""Minimum interval (ns) between calls to the pollers. Their shortest timeout is 5 ms, so polling after each
 batch, about once a millisecond, is unnecessary.
 """
 
@@ -78,7 +78,7 @@ class BusStats:
 
 @dataclass(frozen=True, slots=True)
 class PortCounters:
-    """Counters kept by the source of the frames, an interface or a recording."""
+    """Counters kept by the frame source, which is an interface or a recording."""
 
     sent: int = 0
     dropped: int = 0
@@ -90,7 +90,7 @@ class PortCounters:
 
 
 class Dispatcher:
-    """Dispatcher of the frames on one bus of the hand.
+    """Dispatcher for the frames on one bus of the hand.
 
     Threads: :meth:`count` and :meth:`count_sent` may be called from any thread, the other methods only from
     the mainline.
@@ -122,7 +122,7 @@ class Dispatcher:
         Args:
             cob_id: Identifier of the frames.
             handler: Handler of the frames. It replaces any previous handler.
-            defects: Collector of the handler's exceptions; by default, that of the bus.
+            defects: Collector of the handler's exceptions; by default, the bus's collector.
         """
         if defects is not None:
             self._owners[cob_id] = defects
@@ -141,7 +141,7 @@ class Dispatcher:
 
         Args:
             poller: Function to call, at most once every 2 ms.
-            defects: Collector of the poller's exceptions; by default, that of the bus.
+            defects: Collector of the poller's exceptions; by default, the bus's collector.
         """
         self._pollers = (*self._pollers, (poller, defects))
 
@@ -149,7 +149,7 @@ class Dispatcher:
         """Handle ``error``, raised during the operation ``doing``.
 
         Raises:
-            Exception: ``error`` itself, which stops a replay. On a live bus, the method is overridden.
+            Exception: ``error`` itself, which stops a replay. A live bus overrides this method.
         """
         raise error
 
@@ -188,7 +188,7 @@ class Dispatcher:
                         continue
                     handler(data, t_ns)
                 going_on = False
-            except Exception as defect:  # ``frames`` goes on with the next frame
+            except Exception as defect:  # ``frames`` continues with the next frame
                 self.contain(self._owners.get(can_id), f"frame 0x{can_id:03X}", defect)
         try:
             self._tally(batch, others)
@@ -196,7 +196,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames of a batch. ``others`` are those of types that no handler accepts."""
+        """Count the frames of a batch. ``others`` are the frames whose type no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -232,7 +232,7 @@ class Dispatcher:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame. Log the first one of each COB-ID. Mainline only."""
+        """Count a malformed frame. Log the first one for each COB-ID. Mainline only."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -248,7 +248,7 @@ class Dispatcher:
         """Return all counters. Any thread.
 
         Args:
-            port: Counters of the source of the frames.
+            port: Counters of the frame source.
         """
         return BusStats(
             received=self._received,

@@ -24,7 +24,7 @@ class End:
 
 
 class DropOldestQueue(Generic[T]):
-    """Queue of at most ``capacity`` items, ended by an :class:`End`. Thread-safe. Writing never blocks.
+    """Queue of at most ``capacity`` items, terminated by an :class:`End`. Thread-safe. Writing never blocks.
 
     The end marker is never dropped. :meth:`get` does not remove it, so every reader gets it.
     """
@@ -34,7 +34,7 @@ class DropOldestQueue(Generic[T]):
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:
-        """Append an item. Drop the oldest items beyond the capacity.
+        """Append an item. If this exceeds the capacity, drop the oldest items.
 
         Returns:
             Number of items dropped.

@@ -38,7 +38,7 @@ def load_baseline(path: Path, profile: PatchProfile) -> Float:
     """Read a patch's baseline from a text file.
 
     Returns:
-        (U, K) resistances at rest, ohm, rounded to REAL32.
+        (U, K) resistances at rest in ohms, rounded to REAL32.
 
     Raises:
         ConfigError: if the file is not a table of U × K positive numbers.

@@ -21,8 +21,8 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 leaves this
-number open. Three periods tolerate one heartbeat delayed by a burst of frames and one destroyed by a bus
+"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 does not specify
+this number. Three periods tolerate one heartbeat delayed by a burst of frames and one destroyed by a bus
 error.
 """
 
@@ -77,11 +77,11 @@ class PatchHealth:
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """Number of EMCY messages with an error since the host started."""
+    """Number of EMCY messages reporting an error since the host started."""
     last_emergency: int | None
-    """Error code of the newest EMCY message with an error; None before the first one."""
+    """Error code of the newest EMCY message reporting an error; None before the first one."""
     emergency_text: str
-    """Description of the newest EMCY message with an error; empty before the first one."""
+    """Description of the newest EMCY message reporting an error; empty before the first one."""
     error_register: int
     rejoins: int = 0
     """Number of times the node has been brought up again since the host started."""
@@ -106,7 +106,7 @@ class PatchHealth:
     life: str = ""
     """Human-readable reason to doubt that the converter is running; empty if there is none."""
     faults: tuple[DataFault, ...] = ()
-    """Faults found in the data of the newest field, each with part, first scan and certainty."""
+    """Faults found in the data of the newest field, each with its part, first scan and certainty."""
     defect: str | None = None
     """Last host operation that raised an exception while serving the patch, with the exception; reset to None
     by the next bring-up.

@@ -1,4 +1,4 @@
-"""Watch the health of a running host and the touches of its patches, and publish changes as events."""
+"""Monitor a running host's health and its patches' touches, and publish changes as events."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ class HealthWatch:
     Args:
         patches: Function that returns the health of each patch.
         buses: Function that returns the health of each bus.
-        events: Where changes are published.
-        defects: Where exceptions are reported.
+        events: Destination of the published changes.
+        defects: Collector of the exceptions.
         all_defects: Function that returns the statistics of all contained exceptions.
         touches: Function that returns the onsets and releases since its last call.
-        now_ns: Function that returns the time of the checks, ns.
+        now_ns: Function that returns the time (ns) of a check.
     """
 
     def __init__(  # noqa: PLR0913 - what is watched, and by which clock

@@ -1,6 +1,6 @@
-"""Determine the limitations of a hand: results that its hand file, its layouts or its noise rule out.
+"""Determine a hand's limitations: results ruled out by its hand file, layouts or noise.
 
-A limitation is not an error. ``skinnode hand check`` lists the limitations, to keep users from expecting more
+A limitation is not an error. ``skinnode hand check`` lists the limitations so that users do not expect more
 than the hand can deliver.
 """
 
@@ -48,8 +48,8 @@ class Limitation:
 def limitations(hand: HandConfig) -> list[Limitation]:
     """Return the limitations of a hand. Patches with the same limitation share an entry.
 
-    The function compiles no kernels. It checks the deadline of the solver only if the kernels are compiled
-    already.
+    The function compiles no kernels. It checks the solver's deadline only if the kernels are already
+    compiled.
     """
     patches: dict[tuple[str, str], list[str]] = {}
     for patch in hand.patches:
@@ -59,7 +59,7 @@ def limitations(hand: HandConfig) -> list[Limitation]:
 
 
 def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str, str]]:
-    """Yield the key and text of each limitation of the solver for a patch."""
+    """Yield the key and text of each solver limitation for a patch."""
     layout = patch.layout.build()
     noise = math.hypot(patch.relative_noise, CodeScale(patch.code_bits).relative_std)
     options = tracker_options(patch, solver, relative_noise=noise)

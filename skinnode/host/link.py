@@ -147,7 +147,7 @@ class BusLink(Dispatcher, Closing):
 
         Args:
             job: Function to run.
-            defects: Collector of the job's exceptions; by default, that of the bus.
+            defects: Collector of the job's exceptions; by default, the bus's collector.
         """
         self._jobs.append((job, self.defects if defects is None else defects))
 
@@ -215,7 +215,7 @@ class BusLink(Dispatcher, Closing):
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
-        """Dispatch one batch of frames. Return whether it contained any."""
+        """Dispatch one batch of frames. Return whether it contained any frames."""
         seen_ns = self.intake.seen_ns  # read first: the batch contains all frames up to this time
         batch = self.intake.take()
         while self._jobs:
@@ -224,8 +224,8 @@ class BusLink(Dispatcher, Closing):
                 job()
             except Exception as error:
                 owner.report("a job on the mainline", error)
-        # While frames are waiting, the pollers get the time of the newest dispatched frame. If they got the
-        # current time, a delay in the host would make nodes appear late.
+        # While frames are waiting, the pollers get the time of the newest dispatched frame. If they were
+        # given the current time, a delay in the host would make nodes appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns

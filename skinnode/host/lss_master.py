@@ -38,7 +38,7 @@ to disk. For comparison, CANopenNode's LSS master waits 1 s for any response.
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
 """Time limits (s) for the response to a fastscan request, in the first and the second fastscan. The second,
-slower one runs only if the first has found no node.
+slower fastscan runs only if the first finds no node.
 """
 
 _TRIES: Final = 2
@@ -51,7 +51,7 @@ responses of other slaves.
 """
 
 _UNDER_WAY_S: Final = 0.4
-"""Pause (s) that follows a timeout, long enough for a late response to arrive."""
+"""Pause (s) after a timeout, long enough for a late response to arrive."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
@@ -106,7 +106,7 @@ class LssMaster:
                     self.set_node_id(node_id)
             except LssFailed:
                 return False
-            finally:  # a slave that has received its first node-ID boots when released
+            finally:  # a slave that has just received its first node-ID boots when released
                 self.release()
             if active not in (None, node_id):
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))

@@ -19,11 +19,11 @@ class NodeFacts:
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) resistances at rest, ohm. The codes of the scans are relative to them."""
+    """(U, K) resistances at rest, in ohms. The scans' codes are relative to these."""
     serial: int | None
     """Serial number of the node; None if the host must not read it."""
     heartbeat_s: float
-    """Heartbeat period of the node, s."""
+    """Heartbeat period of the node, in seconds."""
     checked: bool = False
     """Whether the summary of each scan contains a check over all codes; False if the revision number of the
     node is unknown.

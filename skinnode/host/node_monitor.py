@@ -25,7 +25,7 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time (ns) for which a restart loop is reported after its last restart."""
+"""Time (ns) for which a restart loop continues to be reported after its last restart."""
 
 SETTLED_NS: Final = 500_000_000
 """Minimum time (ns) for which the condition stays *restarting* after the last restart in a loop, even if the
@@ -46,7 +46,7 @@ times the time that a single node needs to send them.
 class NodeMonitor:
     """Collector of the evidence about one node.
 
-    Threads: any thread may call :meth:`health`. The other methods are for the mainline only.
+    Threads: any thread may call :meth:`health`. Only the mainline may call the other methods.
 
     Args:
         patch: Name of the patch.
@@ -120,8 +120,8 @@ class NodeMonitor:
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY message.
 
-        The message holds the error code (u16), the error register (u8) and five manufacturer-specific bytes.
-        Error code 0 means that all errors have been cleared.
+        The message contains the error code (u16), the error register (u8) and five manufacturer-specific
+        bytes. Error code 0 means that all errors have been cleared.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
@@ -177,9 +177,9 @@ class NodeMonitor:
         """Return the health of the patch.
 
         Args:
-            now_ns: Current monotonic time, ns.
-            heartbeat_s: Heartbeat period, s.
-            scan_s: Scan period, s.
+            now_ns: Current monotonic time (ns).
+            heartbeat_s: Heartbeat period (s).
+            scan_s: Scan period (s).
             conflicts: Number of frames that contradict another frame of the same scan.
             t_passed_ns: Monotonic arrival time (ns) of the newest scan that was not withheld; 0 if there is
                 none. None if scans are never withheld.

@@ -26,7 +26,7 @@ periods.
 
 _PROBE_NS: Final = 250_000_000
 """Interval (ns) between requests to an absent node. The requests reveal a node that sends no heartbeats and
-whose boot-up message was lost. For four nodes, the requests take 0.1 % of a bus's capacity.
+whose boot-up message was lost. For four nodes, the requests use 0.1 % of a bus's capacity.
 """
 
 _SEARCH_NS: Final = 1_000_000_000
@@ -182,7 +182,7 @@ class NodeSupervision:
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty after an unexpected exception.
 
-        If this method raises an exception itself, the next iteration calls it again.
+        If this method itself raises an exception, the next iteration calls it again.
         """
         remote = node.remote
         count = remote.defects.count
@@ -255,7 +255,7 @@ def _read_back(node: Supervised) -> None:
 
 
 def _search(remote: RemoteNode) -> bool:
-    """Search for a node by LSS. Return whether it was found."""
+    """Search for a node over LSS. Return whether it was found."""
     try:
         return remote.search()
     except Exception as error:

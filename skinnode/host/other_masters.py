@@ -16,7 +16,7 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Minimum gap (ns) between two frames of one type from other masters for the second to be logged."""
+"""Minimum time (ns) between two frames of the same type from other masters for the second to be logged."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"
 
@@ -34,7 +34,7 @@ class OtherMasterStats:
     sdo_requests: int
     """Number of SDO requests to the hand's nodes, for example from a second host or a service tool."""
     heartbeats: int
-    """Number of heartbeats with the node-ID of the host."""
+    """Number of heartbeats with the host's node-ID."""
     last_ns: int | None
     """Monotonic time (ns) of the newest frame from another master; None before the first one."""
 

@@ -1,8 +1,8 @@
 """Turn the chunks of a patch into fields.
 
 The mainline assembles each scan and puts it into a one-element buffer, the *box*. A worker thread takes the
-scan from the box, decodes it and solves it. A scan that is replaced in the box by a newer one is counted as
-skipped. A token limits each stream to one worker at a time.
+scan from the box, decodes it and solves it. If a newer scan replaces it in the box, the older scan is counted
+as skipped. A token limits each stream to one worker at a time.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class StreamStats:
     untrusted: int
     """Number of untrusted fields."""
     invalid_codes: int
-    """Number of codes in all solved scans that mark a crossing as over range, short, open or missing."""
+    """Number of codes, over all solved scans, that mark a crossing as over range, short, open or missing."""
     assembler: AssemblerStats
     failed: int = 0
     """Number of scans whose decoding or solving raised an exception."""
@@ -97,7 +97,7 @@ def _find_nothing(scan: Scan, number: int) -> Verdict:
 
 @dataclass(frozen=True, slots=True)
 class StreamOutput:
-    """Destinations of a stream's scans, fields and exceptions."""
+    """Destinations for a stream's scans, fields and exceptions."""
 
     workers: Workers | Inline
     publisher: Publisher
@@ -122,7 +122,7 @@ class StreamOptions:
     partial: Partial = "pass"
     """Treatment of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node. Scans may then be under way when the stream is resumed."""
+    """Whether another master starts the node. If so, scans may be under way when the stream is resumed."""
 
 
 class PatchStream:
@@ -131,8 +131,8 @@ class PatchStream:
     Scans are withheld until :meth:`resume` sets a solver. If decoding or solving raises an exception, only
     the current scan is lost.
 
-    Threads: any thread may call :meth:`settled` and :meth:`stats`. The other public methods are for the
-    mainline only.
+    Threads: any thread may call :meth:`settled` and :meth:`stats`. Only the mainline may call the other
+    public methods.
     """
 
     def __init__(
@@ -214,12 +214,12 @@ class PatchStream:
         return self._solver is None
 
     def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
-        """Decode and solve the following scans with ``solver``.
+        """Decode and solve subsequent scans with ``solver``.
 
         Args:
             solver: Solver for the scans.
-            withholdings: Value of ``withholdings`` that the caller has last seen. If :meth:`withhold` has
-                been called since, :meth:`resume` has no effect.
+            withholdings: Value of ``withholdings`` last seen by the caller. If :meth:`withhold` has been
+                called since then, :meth:`resume` has no effect.
             anew: Whether the node has restarted. If so, the frames received so far are discarded.
         """
         if withholdings != self.withholdings:

@@ -22,7 +22,7 @@ def check_timeout(timeout_s: float | None) -> None:
     """Check a timeout.
 
     Raises:
-        ValueError: if the timeout is negative, not a number, or above the limit of the operating system.
+        ValueError: if the timeout is negative, not a number, or above the operating system's limit.
     """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
@@ -50,7 +50,7 @@ class Subscription(Closing):
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._subscribed = patches
-        # One counter per patch, because only one worker at a time publishes the fields of a patch.
+        # One counter per patch, because only one worker at a time publishes a patch's fields.
         self._dropped = dict.fromkeys([*patches, ""], 0)
         self._wakers: dict[object, Callable[[], object]] = {}  # one wake-up function per waiting task
 
@@ -126,7 +126,7 @@ class Subscription(Closing):
         """Yield fields until the host closes.
 
         Raises:
-            TimeoutError: if no field arrives within the timeout of the subscription.
+            TimeoutError: if no field arrives within the subscription's timeout.
             SkinError: the error that stopped the host, if any.
         """
         while True:
@@ -209,7 +209,7 @@ class Publisher:
         chosen = self._patches if patch is None else frozenset([patch])
         subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
-        # No lock is needed: setting and removing an item of a dict are atomic, and readers copy the dict.
+        # No lock is needed: setting and removing dict items is atomic, and readers copy the dict.
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:

@@ -88,7 +88,7 @@ class RemoteNode:
 
     @property
     def heartbeat_s(self) -> float:
-        """Heartbeat period of the node, s."""
+        """Heartbeat period of the node, in seconds."""
         return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
 
     def configure(
@@ -139,7 +139,7 @@ class RemoteNode:
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
     def start(self, solver: ScanSolver, withholdings: int) -> None:
-        """Pass the following scans to ``solver``. If the host is the NMT master, start the node.
+        """Pass subsequent scans to ``solver``. If the host is the NMT master, start the node.
 
         Args:
             solver: Solver for the node's scans.
@@ -212,7 +212,7 @@ class RemoteNode:
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:
             raise NodeError(node_id, f"{said}: another master runs the bus")
-        if self.patch.baseline is not None:  # the host would restore the baseline from the file at once
+        if self.patch.baseline is not None:  # the host would immediately restore the baseline from the file
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if (
             not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
@@ -266,11 +266,11 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the host is the NMT master and knows the serial number, as a search by LSS requires."""
+        """Whether the host is the NMT master and knows the serial number, as an LSS search requires."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the node by LSS with its serial number. Return whether it was found.
+        """Search for the node over LSS, by serial number. Return whether it was found.
 
         A node that is found boots with the node-ID from the hand file.
         """

@@ -41,13 +41,13 @@ _SETTLE_S: Final = 0.1
 """Time limit (s) for responses to cease after an abort. Another SDO client may keep the node responding."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmissions in one transfer. A node that requests more probably rejects every block,
-so the transfer fails.
+"""Maximum number of retransmissions in one transfer. If a node requests more than this, it probably rejects
+every block, so the transfer fails.
 """
 
 
 class Client(SdoClient):
-    """SDO client of the canopen package for node ``node_id``, without an object dictionary."""
+    """canopen SDO client for node ``node_id``, without an object dictionary."""
 
     def __init__(self, network: canopen.Network, node_id: int) -> None:
         empty: Any = ObjectDictionary  # canopen's constructor has no type annotations

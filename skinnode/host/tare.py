@@ -1,4 +1,4 @@
-"""Tare a patch: the node measures a new baseline, with which the host solves the following scans."""
+"""Tare a patch: the node measures a new baseline, and the host uses it to solve subsequent scans."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def tare(
         deadline_s: Time limit (s) for the new baseline.
 
     Raises:
-        NodeTimeout: if the solver uses no new baseline in time.
+        NodeTimeout: if the solver has no new baseline in time.
         SkinError: for the reasons listed under :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies

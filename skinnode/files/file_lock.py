@@ -27,7 +27,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """Raised if the path of a lock file is a symbolic link, a folder, a pipe or a device."""
+    """Raised if a lock file's path is a symbolic link, a folder, a pipe or a device."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -57,7 +57,7 @@ class FileLock:
 
 
 def lock_file(path: Path) -> FileLock:
-    """Create the file ``path`` if necessary, lock it, and write the ID of this process into it.
+    """Create the file ``path`` if necessary, lock it, and write this process's ID into it.
 
     Returns:
         The lock; the caller must release it.

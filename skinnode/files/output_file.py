@@ -31,7 +31,7 @@ def require_writable(option: str, file: Path) -> None:
 
 
 def write_text(option: str, file: Path, text: str) -> None:
-    """Write ``text`` in UTF-8 to ``file``, like :func:`write_bytes`.
+    """Write ``text`` to ``file`` as UTF-8, like :func:`write_bytes`.
 
     Raises:
         ConfigError: The file cannot be written; a regular file then keeps its old content.

@@ -1,8 +1,8 @@
 """Configure a node: check its identity and layout, write its parameters, and read its baseline.
 
-A node-ID may belong to a different kind of device, such as a motor drive. The host therefore compares the
-identity and the layout of a node with the hand file before it writes anything. It reads back every parameter
-that it writes.
+A node-ID may belong to a different kind of device, such as a motor drive. The host therefore compares a
+node's identity and layout with the hand file before it writes anything. It reads back every parameter that it
+writes.
 
 On a bus that another master runs, the host sends no NMT commands and leaves the SYNC parameters unchanged. It
 writes a patch-specific parameter only if the node's value differs from the hand file. With
@@ -124,7 +124,7 @@ class Configurator:
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
-        """Check the identity object (0x1018). Return the serial number and the revision number."""
+        """Check the identity object (0x1018). Return the serial and revision numbers."""
         for subindex, what, expected in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),

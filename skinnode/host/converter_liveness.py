@@ -19,10 +19,10 @@ scans in which no code changes. A converter counts as stopped if all of these co
   rest and runs under a press are compared separately: a converter that repeats its codes for minutes at rest
   may repeat them for only two or three scans under a press.
 
-**Doubt.** A few repeated scans do not prove that a converter has stopped, yet the fields may already show a
-press that is over. If all codes stop changing in mid-movement, the next ``DOUBT_RUN`` fields are therefore
-not trusted. This rule applies only to patches without a phase whose codes are noisy and have never all
-repeated before.
+**Doubt.** A few repeated scans do not prove that a converter has stopped, but the fields may still show a
+press that has ended. If all codes stop changing in the middle of a movement, the next ``DOUBT_RUN`` fields
+are therefore not trusted. This rule applies only to patches without a phase whose codes are noisy and have
+never all repeated before.
 
 If neither the phase nor the codes are conclusive and no code has changed for a second, the state is unknown
 (:attr:`Alive.CANNOT_TELL`).
@@ -85,7 +85,7 @@ _MOVED: Final = 16
 within its quantization step.
 """
 _SPREAD: Final = 30
-"""Minimum number of distinct codes of a pressed patch that differ from the rest code by at least ``_MOVED``.
+"""Minimum number of distinct codes that differ from the rest code by at least ``_MOVED`` on a pressed patch.
 """
 
 
@@ -161,15 +161,15 @@ class ConverterLiveness:
             return f"its codes have not changed for {counted(self._run, 'scan')}"
         if self.doubtful:
             return (
-                "cannot tell whether its converter runs: its codes stopped changing in mid-movement, "
+                "cannot tell whether its converter is running: its codes stopped changing mid-movement, "
                 f"{counted(self._run, 'scan')} ago"
             )
         if self.alive is Alive.YES:
             return ""
         if self._t_proof_ns is None:
-            return "cannot tell whether its converter runs: no code has changed yet"
+            return "cannot tell whether its converter is running: no code has changed yet"
         still_s = (self._t_ns - self._t_proof_ns) * 1e-9
-        return f"cannot tell whether its converter runs: no code has changed for {still_s:.0f} s"
+        return f"cannot tell whether its converter is running: no code has changed for {still_s:.0f} s"
 
     def on_scan(
         self, scan: Scan, counts: tuple[int, int, int, int, int], last: NDArray[Any], run: NDArray[Any]

@@ -27,7 +27,7 @@ Handler = Callable[[bytes, int], None]
 _MARK_NS: Final = 100_000_000
 """Interval (ns) between updates of the bus load."""
 _MARKS: Final = 10
-"""Length of the moving average of the bus load, in units of ``_MARK_NS``."""
+"""Length of the bus load's moving average, in units of ``_MARK_NS``."""
 
 _POLL_NS: Final = 2_000_000
 """Minimum interval (ns) between calls to the pollers. Their shortest timeout is 5 ms, so polling after each
@@ -49,7 +49,7 @@ class BusStats:
     ignored.
     """
     error_frames: int
-    """Number of error frames, with which the interface reports bus errors and controller states."""
+    """Number of error frames, which the interface uses to report bus errors and controller states."""
     bus_offs: int
     """Number of times the CAN controller has gone bus-off."""
     controller: BusState | None
@@ -57,7 +57,7 @@ class BusStats:
     foreign_ids: Mapping[int, int]
     """Number of foreign data frames by COB-ID."""
     read: int
-    """Number of frames read from the interface, of all types."""
+    """Number of frames of all types read from the interface."""
     waiting: int
     """Number of frames read from the interface but not dispatched yet."""
     kernel_dropped: int

@@ -1,7 +1,7 @@
 """Provide a bounded queue that never blocks the writer: a full queue drops its oldest items.
 
 The standard library has no such queue. A full ``queue.Queue`` blocks or rejects the new item.
-``collections.deque(maxlen=…)`` does not count the items it drops, and a reader cannot wait for an item.
+``collections.deque(maxlen=…)`` does not count the items it drops, and does not let a reader wait for an item.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """End marker of a queue, with the error that stopped the host, if any."""
+    """End marker of a queue; contains the error that stopped the host, if any."""
 
     error: SkinError | None = None
 

@@ -57,7 +57,7 @@ class HealthEvent:
 
 
 class EventSubscription:
-    """Subscription to the events of a running host. Read it with ``for`` or :meth:`get`.
+    """Subscription to a running host's events. Read it with ``for`` or :meth:`get`.
 
     The iteration ends when the host closes. A full queue drops its oldest event; ``dropped`` counts these
     events. Any thread may read.

@@ -38,7 +38,7 @@ class HandFrame:
     """
 
     scan: int
-    """Scan number of all fields: number of the SYNC, counted from the start of the host. It does not wrap
+    """Scan number of all fields: the SYNC number, counted from the start of the host. It does not wrap
     around.
     """
     t_sync_ns: int
@@ -71,7 +71,7 @@ class HandFrame:
 
     @property
     def distrust(self) -> Mapping[str, str]:
-        """Human-readable reason for each patch that is not trusted, by patch name."""
+        """Human-readable reasons why patches are not trusted, by patch name."""
         reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
         return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
 
@@ -87,7 +87,7 @@ class HandFrame:
             link: Name of the link; ``hand`` for the patches without a link.
 
         Raises:
-            ValueError: if the link carries no patch.
+            ValueError: if the link has no patch.
         """
         if link not in self.wrenches:
             raise ValueError(f"link: got {link!r}, must be one of {', '.join(map(repr, self.wrenches))}")
@@ -97,8 +97,8 @@ class HandFrame:
     def wrenches(self) -> Mapping[str, Wrench]:
         """Wrench on the skin of each link, by link name.
 
-        The torque is taken about the origin of the link's frame. Every link that carries a patch has an
-        entry, even without contact. The entry ``hand`` combines the patches without a link.
+        The torque is taken about the origin of the link's frame. Every link with a patch has an entry, even
+        if nothing touches it. The entry ``hand`` combines the patches without a link.
         """
         patches: dict[str, list[str]] = {}
         for patch in (*self.fields, *self.missing):
@@ -136,7 +136,7 @@ class HandFrame:
 
     @functools.cached_property
     def _link_contacts(self) -> tuple[HandContact, ...]:
-        """Contacts on all patches, each in the frame of its link, largest normal force first."""
+        """Contacts on all patches, each in its link's frame, largest normal force first."""
         found = [
             HandContact.on_link(contact, patch, self.skeleton.mount(patch), trusted=each.trusted)
             for patch, each in self.fields.items()
@@ -312,8 +312,7 @@ class HandSubscription(Closing):
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time (s) until ``end_ns`` or the next deadline, whichever is first; None without either.
-        """
+        """Return the time (s) to the earlier of ``end_ns`` and the next deadline; None if neither is set."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 

@@ -55,7 +55,7 @@ class HostStats:
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
-        """Deprecated alias of :attr:`other_masters`, to be removed in version 0.2."""
+        """Deprecated alias for :attr:`other_masters`, to be removed in version 0.2."""
         warnings.warn(
             "HostStats.rivals is now HostStats.other_masters; the old name will be removed in version 0.2",
             DeprecationWarning,

@@ -24,7 +24,7 @@ from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
 """Standard deviation (fraction of the clearance) above which the resistances alone do not determine the
-displacements well enough. Few presses are deeper than this fraction.
+displacements well enough. Few presses are deeper than this fraction of the clearance.
 """
 
 
@@ -40,7 +40,7 @@ class Limitation:
     patches: tuple[str, ...]
     """Names of the patches."""
     key: str
-    """Key of the hand file that can be changed to remove the limitation."""
+    """Hand-file key that can be changed to remove the limitation."""
     text: str
     """Missing result, and the reason why it is missing."""
 
@@ -77,7 +77,7 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
         yield (
             "solver.method",
             f"at a noise of {noise:.0e}, the exact inverse has errors of ± {share:.0%} of the clearance, "
-            'which is useless; method = "auto" uses the posterior',
+            'which are too large to be useful; method = "auto" uses the posterior',
         )
     if method == "exact" and not patch.tolerances.build().exact:
         yield (

@@ -46,8 +46,8 @@ _TRIES: Final = 2
 """
 
 _SETTLE: Final = 0.2
-"""Pause after the first response to a fastscan request, as a fraction of the timeout. It leaves time for the
-responses of other slaves.
+"""Pause after the first response to a fastscan request, as a fraction of the timeout. It leaves time for
+other slaves' responses.
 """
 
 _UNDER_WAY_S: Final = 0.4
@@ -89,7 +89,7 @@ class LssMaster:
         """Make the patch with this serial number boot with ``node_id``.
 
         The patch does not store the node-ID: that is left to a technician. A patch that already has the
-        node-ID is left alone.
+        node-ID is left unchanged.
 
         Returns:
             Whether the patch was found and accepted the node-ID.
@@ -126,7 +126,7 @@ class LssMaster:
         return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
     def find_unconfigured(self) -> LssAddress | None:
-        """Find a node without a node-ID by fastscan.
+        """Use fastscan to find a node without a node-ID.
 
         The node stays in configuration state until :meth:`release` is called.
 
@@ -163,7 +163,7 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        # before the next request, wait for the responses of other slaves
+        # before the next request, wait for other slaves' responses
         if answer is not None:
             clock.sleep(answer_s * _SETTLE)
         return answer

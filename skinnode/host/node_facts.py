@@ -12,7 +12,7 @@ from skinnode.protocol.profile import PatchProfile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeFacts:
-    """Facts about a patch, collected during the configuration of its node."""
+    """Facts about a patch, collected while its node is configured."""
 
     config: PatchConfig
     layout: PatchLayout
@@ -25,10 +25,10 @@ class NodeFacts:
     heartbeat_s: float
     """Heartbeat period of the node, in seconds."""
     checked: bool = False
-    """Whether the summary of each scan contains a check over all codes; False if the revision number of the
-    node is unknown.
+    """Whether each scan's summary contains a check over all codes; False if the node's revision number is
+    unknown.
     """
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """Return a copy with another baseline."""
+        """Return a copy with a different baseline."""
         return replace(self, baseline_ohm=baseline_ohm)

@@ -1,4 +1,4 @@
-"""Evaluate the heartbeats and EMCY messages of a node, and derive the health of its patch."""
+"""Evaluate a node's heartbeats and EMCY messages, and derive the health of its patch."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ times the time that a single node needs to send them.
 
 
 class NodeMonitor:
-    """Collector of the evidence about one node.
+    """Collector of evidence about one node.
 
     Threads: any thread may call :meth:`health`. Only the mainline may call the other methods.
 
@@ -101,7 +101,7 @@ class NodeMonitor:
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Process a heartbeat or boot-up message. It must be one byte long."""
+        """Process a heartbeat or boot-up message, which must be one byte long."""
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
@@ -135,7 +135,7 @@ class NodeMonitor:
 
     @property
     def error_register(self) -> int:
-        """Error register of the node, as last reported."""
+        """Last reported error register of the node."""
         return self._error_register
 
     @property
@@ -257,7 +257,7 @@ class NodeMonitor:
         beats, period_ns = self._beats, heartbeat_s * 1e9
         if len(beats) < BEATS:
             return False
-        first_ns, last_ns = beats[0], beats[-1]  # never fewer, even if the mainline appends one concurrently
+        first_ns, last_ns = beats[0], beats[-1]  # appending does not shrink the deque
         if now_ns - last_ns > HEARTBEATS_MISSED * period_ns:
             return False
         return last_ns - first_ns < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns

@@ -41,7 +41,7 @@ DRIFT: Final = 1e-3
 much.
 """
 UNEVEN: Final = 0.05
-"""Maximum deviation of the crossings of a drifting wire from their median, as a fraction of the drift."""
+"""Maximum deviation of a drifting wire's crossings from their median, as a fraction of the drift."""
 APART: Final = 0.3
 """Minimum difference in R/R0 between a drifting wire and each adjacent wire, as a fraction of the drift."""
 _SHOWN: Final = 8
@@ -49,7 +49,7 @@ _SHOWN: Final = 8
 
 
 class WireWindows:
-    """Detector of noise and drift in the wires of one patch. Used only by the mainline.
+    """Detector for noise and drift in one patch's wires. Used only by the mainline.
 
     Args:
         scale: Mapping of R/R0 to codes.
@@ -120,7 +120,7 @@ class WireWindows:
 
 
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
-    """Return the lower quartile of the noise over the crossings (codes); 0 if it is not measurable.
+    """Return the lower quartile (codes) of the noise over the crossings; 0 if it is not measurable.
 
     A crossing counts as noiseless if its codes span fewer than three values. Two values are not enough,
     because even without noise a resistance at the edge of a quantization step may alternate between two
@@ -129,7 +129,7 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
-        power: (U, K) mean square of the noise, codes²; NaN where a code is not a measurement.
+        power: (U, K) mean square of the noise, in codes²; NaN where a code is not a measurement.
     """
     half = WINDOW // 2
     moved = np.abs(codes[half:].mean(axis=0) - codes[:half].mean(axis=0))

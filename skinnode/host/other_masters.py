@@ -23,7 +23,7 @@ SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's 
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Counters of the frames received from other masters.
+    """Counters of frames received from other masters.
 
     On a bus that another master runs, SYNC and NMT commands are legitimate: ``syncs`` and ``nmt_commands``
     stay 0.
@@ -40,7 +40,7 @@ class OtherMasterStats:
 
 
 class OtherMasters:
-    """Detector of other masters on one bus. It logs the first frame of each type. Mainline only."""
+    """Detector for other masters on one bus. It logs the first frame of each type. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -48,7 +48,7 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """Return the handlers that count the frames of other masters, by COB-ID.
+        """Return the handlers that count other masters' frames, by COB-ID.
 
         On a bus that another master runs, there is no handler for SYNC and NMT commands.
 

@@ -68,7 +68,7 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Recorder of the events, apart from received frames, that decide which scans are solved.
+    """Recorder of the events, apart from received frames, that determine which scans are solved.
 
     All methods are called on the mainline.
     """
@@ -91,7 +91,7 @@ def _ignore(scan: Scan) -> None:
 
 
 def _find_nothing(scan: Scan, number: int) -> Verdict:
-    """Return a verdict without faults; default of :attr:`StreamOptions.judge`."""
+    """Return a fault-free verdict; default of :attr:`StreamOptions.judge`."""
     return FAULTLESS
 
 
@@ -297,7 +297,7 @@ class PatchStream:
 
         Args:
             times_ns: Monotonic arrival times (ns) of the last frames of the skipped scans.
-            within_ns: Tolerance (ns) of the comparison.
+            within_ns: Tolerance (ns) for the comparison.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 

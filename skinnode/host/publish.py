@@ -1,4 +1,4 @@
-"""Pass fields from the worker threads to the bounded queues of the subscribers."""
+"""Pass fields from the worker threads to the subscribers' bounded queues."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def check_timeout(timeout_s: float | None) -> None:
 
 
 def check_capacity(capacity: int) -> None:
-    """Check the capacity of a queue.
+    """Check a queue's capacity.
 
     Raises:
         ValueError: if the capacity is not an integer of at least 1.
@@ -41,9 +41,9 @@ def check_capacity(capacity: int) -> None:
 class Subscription(Closing):
     """Subscription to fields. Read it with ``for``, ``async for`` or :meth:`get`.
 
-    Fields are delivered in the order of publication. A full queue drops its oldest field; ``dropped`` counts
-    these fields. A subscription accepts fields until it is closed, its ``with`` block exits or the last
-    reference to it is deleted. Any thread or event loop may read it.
+    Fields are delivered in publication order. A full queue drops its oldest field; ``dropped`` counts these
+    fields. A subscription accepts fields until it is closed, its ``with`` block exits or the last reference
+    to it is deleted. Any thread or event loop may read it.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
@@ -176,7 +176,7 @@ class Subscription(Closing):
 
 
 class Publisher:
-    """Subscriptions of a host, and the newest field of each patch.
+    """A host's subscriptions, and the newest field of each patch.
 
     If passing a field to a subscriber raises an exception, only that subscriber loses the field. The
     exception is reported to ``defects``.

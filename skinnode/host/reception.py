@@ -77,8 +77,8 @@ def receive_patch(
         hand: Configuration of the hand to which the patch belongs.
         dispatcher: Dispatcher of the patch's bus.
         ticks: SYNC times of the patch's bus.
-        output: Workers and publisher for the patch's scans, and collector of the exceptions. Without a
-            collector, handlers raise their exceptions, and an exception in the solver stops the publisher.
+        output: Workers and publisher for the patch's scans, and collector of exceptions. Without a collector,
+            handlers raise their exceptions, and an exception in the solver stops the publisher.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)

@@ -160,7 +160,8 @@ class RemoteNode:
         """Read the node's current baseline. Create a new solver if needed.
 
         Returns:
-            Solver with the baseline read; None if the baseline is unchanged and no scans are withheld.
+            Solver with the baseline that was read; None if the baseline is unchanged and no scans are
+            withheld.
 
         Raises:
             SkinError: for the reasons listed under :meth:`Configurator.settle_baseline`.

@@ -1,4 +1,4 @@
-"""Read and write the object dictionary of a remote node by SDO.
+"""Read and write a remote node's object dictionary over SDO.
 
 The SDO client of the canopen package blocks the calling thread until the mainline delivers the response
 through :meth:`SkinNetwork.notify`. It does not limit the length or duration of a transfer, so a faulty node
@@ -91,7 +91,7 @@ class SkinNetwork(canopen.Network):
 
 
 class RemoteOd:
-    """Object dictionary of a remote node, read and written by SDO.
+    """Object dictionary of a remote node, read and written over SDO.
 
     A value is of type ``u8``, ``u16``, ``u32`` or ``f32``. ``abandoned`` is called after each segment. If it
     returns True, the transfer is aborted and Abandoned is raised. A transfer that gets no response or raises
@@ -164,7 +164,7 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Return a long value by block transfer, or by segmented transfer if the node aborts that."""
+        """Return a long value by block transfer or, if the node aborts that, by segmented transfer."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
@@ -303,7 +303,7 @@ class RemoteOd:
 
 
 def _send(stream: Any, data: bytes) -> None:
-    """Write ``data`` to a stream in segments. Empty data is sent as one empty segment."""
+    """Write ``data`` to a stream in segments. Empty data are sent as one empty segment."""
     at = stream.write(data[:SEGMENT_BYTES])
     while at < len(data):
         at += stream.write(data[at : at + SEGMENT_BYTES])

@@ -3,8 +3,8 @@
 ==================  =========================================================  ==============================
 stream              canopen 2.4.1                                              here
 ==================  =========================================================  ==============================
-block upload        calls its own ``abort``, which it does not have, if the    has one
-                    end of the transfer does not arrive
+block upload        calls a missing method, ``abort``, if the end of the       has the method
+                    transfer does not arrive
 block upload        requests a late segment twice                              requests it once
 block download      raises RuntimeError if a segment of the last block must    sends it again
                     be sent again; its CRC then counts segments twice

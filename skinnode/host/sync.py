@@ -95,7 +95,7 @@ Send = Callable[[int, bytes], None]
 
 
 class SyncProducer(Closing):
-    """Simultaneous or staggered SYNC producer for one or more buses; runs until :meth:`close`.
+    """Producer of simultaneous or staggered SYNC on one or more buses; runs until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
     the first SYNC. If the thread is a whole period late, it skips that period, so that two SYNC messages are

@@ -16,7 +16,7 @@ from skinnode.process.closing import Closing
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Error handler of a job, called on the same thread as the job. It must not raise."""
+"""Error handler for a job, called on the same thread as the job. It must not raise."""
 
 
 class Workers(Closing):

@@ -82,7 +82,7 @@ def frame_of(data: bytes, name: str) -> Frame:
     """Return the CAN frame from an encoded message; the frame's ``t_ns`` is a time since 1970.
 
     Args:
-        data: Message as CDR.
+        data: CDR-encoded message.
         name: Name of the message.
 
     Raises:

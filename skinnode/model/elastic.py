@@ -39,7 +39,7 @@ class Rubber:
             theory remains exact under friction.
 
     Raises:
-        ValueError: If the modulus is not positive and finite or the ratio is outside 0 … 0.5.
+        ValueError: If the modulus is not positive and finite or the ratio is not between 0 and 0.5.
     """
 
     young_pa: float = 0.7e6

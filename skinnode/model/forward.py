@@ -40,7 +40,7 @@ def resistance_ohm(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
     Args:
         layout: The patch.
-        upper_m: (U, N, 3) positions of the upper electrodes, metres.
+        upper_m: (U, N, 3) positions of the upper electrodes, in metres.
 
     Returns:
         (U, K) resistances, in ohms.
@@ -56,7 +56,7 @@ def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
     Args:
         layout: The patch.
-        upper_m: (U, N, 3) positions of the upper electrodes, metres.
+        upper_m: (U, N, 3) positions of the upper electrodes, in metres.
 
     Returns:
         (U, K, N, 3) Jacobian, in 1/m².

@@ -81,7 +81,7 @@ _FLAT.setflags(write=False)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """Contact between a body and the skin, with the standard deviation of each value."""
+    """Contact between a body and the skin, including the standard deviation of each value."""
 
     centroid_m: Float
     """(3,) centre of the normal load on the undeformed skin, in layout coordinates (metres)."""

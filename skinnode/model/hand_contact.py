@@ -1,4 +1,4 @@
-"""Contacts and wrenches in the coordinate frame of a link or of the hand, with their covariances.
+"""Contacts and wrenches, including covariances, in the coordinate frame of a link or of the hand.
 
 A contact exerts a force f on the skin at a point r. Its wrench consists of the force f and the torque r × f
 about the origin of the frame. The covariance of the wrench is propagated to first order from the covariances

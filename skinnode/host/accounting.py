@@ -39,7 +39,7 @@ def discrepancies(stats: HostStats) -> list[str]:
     malformed = sum(bus.malformed for bus in stats.buses.values())
     if rejected > malformed:
         found.append(
-            f"got {rejected} PDOs with wrong length or format, must be at most the {malformed} malformed frames"
+            f"got {rejected} PDOs of wrong length or format, must be at most the {malformed} malformed frames"
         )
     return found
 

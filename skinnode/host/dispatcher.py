@@ -129,11 +129,11 @@ class Dispatcher:
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch of frames, of all types, to ``listener`` before the handlers. Mainline only."""
+        """Pass each batch of frames, of all types, to ``listener`` before the handlers."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Stop passing batches of frames to ``listener``. Mainline only."""
+        """Stop passing batches of frames to ``listener``."""
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
@@ -157,7 +157,7 @@ class Dispatcher:
         """Ignore the predicted end times of scans. Only a live bus uses them."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
-        """Add a sent frame to the bus load. Any thread."""
+        """Add a sent frame to the bus load. Thread-safe."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
@@ -232,7 +232,7 @@ class Dispatcher:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame. Log the first one for each COB-ID. Mainline only."""
+        """Count a malformed frame. Log the first one for each COB-ID."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -245,7 +245,7 @@ class Dispatcher:
             )
 
     def count(self, port: PortCounters = PortCounters()) -> BusStats:
-        """Return all counters. Any thread.
+        """Return all counters. Thread-safe.
 
         Args:
             port: Counters of the frame source.
@@ -278,7 +278,7 @@ class Dispatcher:
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Update the bus load. Mainline only: the load meter is not thread-safe."""
+        """Update the bus load. Called only on the mainline, because the load meter is not thread-safe."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

@@ -87,7 +87,7 @@ class EventSubscription:
             yield event
 
     def offer(self, event: HealthEvent | End) -> None:
-        """Queue an event or an end marker. Never blocks. Any thread."""
+        """Queue an event or an end marker. Never blocks. Thread-safe."""
         self.dropped += self._queue.put(event)
 
 

@@ -78,7 +78,7 @@ class BusLink(Dispatcher, Closing):
         self.network = SkinNetwork(self.send)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a data frame. Any thread.
+        """Send a data frame. Thread-safe.
 
         Raises:
             BusError: if the interface does not accept the frame.
@@ -123,7 +123,7 @@ class BusLink(Dispatcher, Closing):
         return RemoteOd(self.network, node_id, lambda error: self.defects.report(doing, error))
 
     def ask_remote(self, can_id: int) -> None:
-        """Send a remote frame, for example for node guarding. Any thread.
+        """Send a remote frame, for example for node guarding. Thread-safe.
 
         Raises:
             BusError: if the interface does not accept the frame.
@@ -139,11 +139,11 @@ class BusLink(Dispatcher, Closing):
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Stop passing sent frames to ``listener``. Mainline only."""
+        """Stop passing sent frames to ``listener``."""
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline, before any frame that arrives later is dispatched. Any thread.
+        """Run ``job`` on the mainline, before any frame that arrives later is dispatched. Thread-safe.
 
         Args:
             job: Function to run.

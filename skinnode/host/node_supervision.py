@@ -232,7 +232,7 @@ class NodeSupervision:
         if remote.link.t_dispatched_ns > max(said_ns, node.since_ns) + patience_ns and not remote.listen_only:
             _log.warning("node %d (%s) is lost: no heartbeat", remote.patch.node_id, remote.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            # until the node has been configured again
+            # scans are withheld until the node has been configured again
             remote.link.call(remote.stream.withhold, remote.defects)
             return
         if node.unconfigured:

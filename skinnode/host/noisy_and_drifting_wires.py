@@ -62,7 +62,7 @@ class WireWindows:
         """Wires currently reported as noisy or drifting."""
         self.windows = 0
         """Number of windows evaluated so far."""
-        self._odd: dict[WireFault, int] = {}  # number of consecutive windows, by fault
+        self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
         self._window: list[Codes] = []
         # mask of the crossings measured in every scan of the window; None if all were measured
         self._measured: NDArray[np.bool_] | None = None

@@ -40,7 +40,7 @@ class OtherMasterStats:
 
 
 class OtherMasters:
-    """Detector for other masters on one bus. It logs the first frame of each type. Mainline only."""
+    """Detector for other masters on one bus. It logs the first frame of each type. Used by the mainline."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -67,7 +67,7 @@ class OtherMasters:
         return handlers
 
     def stats(self) -> OtherMasterStats:
-        """Return all counters. Any thread."""
+        """Return all counters. Thread-safe."""
         counts = self._counts
         last_ns = max(self._last_ns.values(), default=None)
         return OtherMasterStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)

@@ -1,4 +1,4 @@
-"""Turn the chunks of a patch into fields.
+"""Turn a patch's chunks into fields.
 
 The mainline assembles each scan and puts it into a one-element buffer, the *box*. A worker thread takes the
 scan from the box, decodes it and solves it. If a newer scan replaces it in the box, the older scan is counted
@@ -44,8 +44,8 @@ priority, because applications are waiting for the fields of all patches.
 class StreamStats:
     """Counters of a patch's scans.
 
-    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan ends as
-    ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
+    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan is finally
+    counted as ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
     """
 
     frames: int

@@ -118,7 +118,7 @@ class Subscription(Closing):
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields, and end the reader's loop after the last queued field. Any thread."""
+        """Stop accepting fields, and end the reader's loop after the last queued field. Thread-safe."""
         self.close()
         self.offer(End(), "")
 
@@ -153,7 +153,7 @@ class Subscription(Closing):
         return TimeoutError(f"no field within {self._timeout_s} s")
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue a field of a subscribed patch, or an end marker. Any thread.
+        """Queue a field of a subscribed patch, or an end marker. Thread-safe.
 
         Never blocks.
         """

@@ -42,7 +42,7 @@ class RemoteNode:
     """Patch of the hand and its CANopen node, as seen by the host.
 
     Threads: one thread at a time, other than the mainline, may bring up the node. Only that thread may call
-    the methods that are not marked "Any thread".
+    the methods that are not marked as thread-safe.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class RemoteNode:
         return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
-        """Command the node to tare. Any thread.
+        """Command the node to tare. Thread-safe.
 
         Raises:
             SkinError: for the reasons listed under :meth:`Host.tare`.

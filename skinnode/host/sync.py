@@ -64,7 +64,7 @@ class Ticks:
 
 
 class SyncFollower:
-    """Follower of another producer's SYNC; stores the SYNC times in ``ticks``. Mainline only."""
+    """Follower of another producer's SYNC; stores the SYNC times in ``ticks``. Used only by the mainline."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
@@ -127,7 +127,7 @@ class SyncProducer(Closing):
         self._thread.start()
 
     def stats(self) -> SyncStats:
-        """Return the counters. Any thread."""
+        """Return the counters. Thread-safe."""
         return SyncStats(self._sent, self._missed, self._failed, self._latest_ns)
 
     def close(self) -> None:

@@ -30,7 +30,7 @@ def tare(
     """Tare a patch. Return as soon as the solver uses the new baseline.
 
     Args:
-        node: Node of the patch.
+        node: The patch's node.
         baselines: Function that returns the number of new baselines that the host has read so far.
         health: Function that returns the current health of the patch.
         deadline_s: Time limit (s) for the new baseline.

@@ -23,7 +23,7 @@ class TouchChange:
     last frame.
     """
     scan: int
-    """Number of this scan."""
+    """Number of the scan that showed the change."""
     touched: bool
     seconds: float | None
     """Duration (s) of the touch that ended; None for an onset."""

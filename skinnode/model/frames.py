@@ -177,9 +177,9 @@ class FieldFrame:
     prior: 1 minus the ratio of the posterior variance to the prior variance. None if all fractions are 1.
     """
     touched: bool | None = None
-    """Whether the detector reports a touch; None if the detector is switched off, or if less than half of the
-    readings are usable. A touch continues without interruption until the mean of four scans agrees with rest.
-    Noise alone causes at most ``false_alarms_per_hour`` reports per hour.
+    """Whether the detector reports a touch; None if the detector is switched off, or if fewer than half of
+    the readings are usable. A touch continues without interruption until the mean of four scans agrees with
+    rest. Noise alone causes at most ``false_alarms_per_hour`` reports per hour.
     """
     touch_odds: float | None = None
     """Odds of touch versus no touch, given the readings of this scan and the odds after the previous scan;

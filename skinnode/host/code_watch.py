@@ -53,7 +53,7 @@ class Verdict:
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of the scan with the faults added.
+        """Return the scan's field with the faults added.
 
         If there is a reason for distrust, no wire of the field is trusted.
         """

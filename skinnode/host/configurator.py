@@ -46,7 +46,7 @@ _POLL_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configurator for the nodes of one bus.
+    """Configurator for the nodes on one bus.
 
     Threads: nodes may be configured in parallel, one thread per node.
     """
@@ -315,7 +315,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
     reconfigures the node.
 
     Returns:
-        True if the node's values are the ones that the host would write.
+        True if the node has the values that the host would write.
 
     Raises:
         NodeError: if reading fails; see :class:`RemoteOd`.

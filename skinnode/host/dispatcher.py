@@ -121,7 +121,7 @@ class Dispatcher:
 
         Args:
             cob_id: Identifier of the frames.
-            handler: Handler of the frames. It replaces any previous handler.
+            handler: Handler for the frames. It replaces any previous handler.
             defects: Collector of the handler's exceptions; by default, the bus's collector.
         """
         if defects is not None:
@@ -129,7 +129,7 @@ class Dispatcher:
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch of frames, of all types, to ``listener`` before the handlers."""
+        """Pass each batch of frames, of all types, to ``listener`` before the handlers are called."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
@@ -232,7 +232,7 @@ class Dispatcher:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame. Log the first one for each COB-ID."""
+        """Count a malformed frame, and log it if it is the first with its COB-ID."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error

@@ -58,7 +58,7 @@ class DropOldestQueue(Generic[T]):
         """Remove and return the oldest item. An end marker is returned but not removed.
 
         Args:
-            timeout_s: Time limit (s); None for no limit, 0 to return at once.
+            timeout_s: Time limit (s); None for no limit, 0 to return immediately.
 
         Raises:
             queue.Empty: if no item arrives in time.

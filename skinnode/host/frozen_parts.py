@@ -87,7 +87,7 @@ class FrozenParts:
         self.assume_noise(0.0, 0)
 
     def assume_noise(self, measured: float, least: int) -> None:
-        """Set, based on the assumed noise, the run lengths at which a wire or crossing may be frozen.
+        """Set the run lengths at which a wire or crossing may be frozen, based on the assumed noise.
 
         Args:
             measured: Noise (codes) measured in the recent windows of scans; 0 if not measurable.

@@ -120,7 +120,7 @@ class HandFrame:
         return wrench_of(self.contacts, HAND, trusted=self.trusted)
 
     def at(self, link_poses: Mapping[str, Pose]) -> HandFrame:
-        """Return a copy with other link poses, for example from the current joint angles.
+        """Return a copy with different link poses, for example from the current joint angles.
 
         Args:
             link_poses: Poses in the hand's frame, by link name. Unlisted links keep their poses. Links

@@ -47,7 +47,7 @@ class HostStats:
     """Counters of other masters' frames, by bus name."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
-    """First malformed frame of each bus that has received one."""
+    """First malformed frame received on each bus, if any."""
     defects: Mapping[str, DefectStats]
     """Statistics of contained exceptions, by patch or bus name. The key ``host`` holds the exceptions that
     concern no particular patch or bus.

@@ -37,7 +37,7 @@ class BusLink(Dispatcher, Closing):
 
     Args:
         config: Configuration of the bus.
-        handlers: Handlers of the data frames, by COB-ID. The mainline calls them.
+        handlers: Handlers for the data frames, by COB-ID. The mainline calls them.
         on_defect: Function called with each exception whose message is new, on the thread that raised it.
         open_port: Function that opens the interface.
 

@@ -253,7 +253,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats arrive too often for a single node."""
+        """Return whether heartbeats arrive too often to come from a single node."""
         beats, period_ns = self._beats, heartbeat_s * 1e9
         if len(beats) < BEATS:
             return False

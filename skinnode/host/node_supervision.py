@@ -139,7 +139,7 @@ class NodeSupervision:
             remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if remote.has_other_master:  # the other master of the bus starts the node
+        if remote.has_other_master:  # the bus's other master starts the node
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:

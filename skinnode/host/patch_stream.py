@@ -118,7 +118,9 @@ class StreamOptions:
     has been called with all earlier scans, so a replay gives the same verdicts as the host.
     """
     watch: Callable[[Scan], None] = _ignore
-    """Function called with each assembled scan after :data:`WATCH_AFTER_NS`, or at the next scan."""
+    """Function called with each assembled scan after :data:`WATCH_AFTER_NS`, or when the next scan
+    arrives.
+    """
     partial: Partial = "pass"
     """Treatment of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False

@@ -246,7 +246,7 @@ class Publisher:
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """End every subscription after its queued fields, because the host closes."""
+        """End every subscription after its queued fields, because the host is closing."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

@@ -32,7 +32,9 @@ ATTEMPTS: Final = 3
 """Maximum number of attempts for a transfer that gets no response, or the response to an earlier transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""canopen's error messages for a missing response. The second follows its own retransmission requests."""
+"""canopen's error messages for a missing response. The second occurs after canopen's own retransmission
+requests.
+"""
 
 _OUT_OF_STEP: Final = (
     AbortCode.TOGGLE_BIT,
@@ -48,7 +50,7 @@ MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
 """Maximum length (bytes) of a value: the baseline of the largest possible patch."""
 
 MAX_TEXT_BYTES: Final = 4096
-"""Maximum length (bytes) of a short value, such as a text."""
+"""Maximum length (bytes) of a short value, such as a string."""
 
 _MAX_NUMBER_BYTES: Final = 8
 

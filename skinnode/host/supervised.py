@@ -89,6 +89,6 @@ class Supervised:
     baseline_ohm: Float | None = None
     """(U, K) baseline used by the solver, in ohms; None before the first bring-up."""
     announced: bool = False
-    """Whether the node has announced a baseline that the solver does not use yet."""
+    """Whether the node has announced a baseline that the solver is not using yet."""
     baselines: int = 0
     complaint: str | None = None

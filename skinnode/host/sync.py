@@ -73,7 +73,7 @@ class SyncFollower:
         """Monotonic time (ns) of the newest SYNC; 0 before the first one."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """Process a received SYNC. A SYNC without a valid counter is only counted."""
+        """Process a received SYNC. A SYNC without a valid counter is counted but not stored."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -99,7 +99,7 @@ class SyncProducer(Closing):
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
     the first SYNC. If the thread is a whole period late, it skips that period, so that two SYNC messages are
-    never sent in quick succession. A SYNC that has been sent on one bus is sent on the others too.
+    never sent in quick succession. A SYNC that has been sent on one bus is also sent on the others.
 
     Threads: a dedicated thread sends the SYNC messages.
 

@@ -27,7 +27,7 @@ _POLL_S: Final = 0.005
 def tare(
     node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
 ) -> None:
-    """Tare a patch. Return as soon as the solver uses the new baseline.
+    """Tare a patch. Return as soon as the solver is using the new baseline.
 
     Args:
         node: The patch's node.
@@ -36,7 +36,7 @@ def tare(
         deadline_s: Time limit (s) for the new baseline.
 
     Raises:
-        NodeTimeout: if the solver has no new baseline in time.
+        NodeTimeout: if the solver does not have a new baseline in time.
         SkinError: for the reasons listed under :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies

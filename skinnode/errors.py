@@ -12,8 +12,8 @@
      │     └ SdoAbort              with the code and text from CiA 301
      └ CodecError(ValueError)      a payload does not match its COB-ID
 
-Lost chunks, stale patches and solves that do not converge occur in normal operation. They are reported by
-statuses and counters, not by exceptions. An array of the wrong shape raises a plain ``ValueError``.
+Lost chunks, stale patches and solves that do not converge occur in normal operation. They are reported
+through statuses and counters, not by exceptions. An array of the wrong shape raises a plain ``ValueError``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SkinError(Exception):
 
 
 class Shown(str):
-    """String that is shown without quotes in error messages."""
+    """String shown without quotes in error messages."""
 
     __slots__ = ()
 
@@ -37,16 +37,16 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""Value of a missing key in error messages."""
+"""Value shown for a missing key in error messages."""
 
 _MOST_SHOWN: Final = 240
 
 
 class ConfigError(SkinError, ValueError):
-    """Invalid value in a configuration file, in another input file or on the command line.
+    """Invalid value in a configuration file, in another input file, or on the command line.
 
     Args:
-        key: Dotted path of the key, such as ``patches[1].node_id``, or name of the option.
+        key: Dotted path of the key, such as ``patches[1].node_id``, or the name of the option.
         got: Value found; None if there is none.
         allowed: Description of the valid values.
         where: File, line and column of the value, if known.
@@ -76,7 +76,7 @@ class BusLoadError(ConfigError):
 
 
 class BusError(SkinError):
-    """Failure to open a CAN interface, or to send or receive on it; the cause is the error of python-can."""
+    """Failure to open a CAN interface, or to send or receive on it; the cause is the python-can error."""
 
 
 class NodeError(BusError):

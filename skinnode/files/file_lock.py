@@ -1,4 +1,4 @@
-"""Lock files that contain the process ID of the owner and never become stale."""
+"""Lock files that contain their owner's process ID and never become stale."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from typing import Final
 
 _TRIES: Final = 100
 """Maximum number of attempts to lock a file. An attempt fails if the previous owner removes the file during
-the attempt."""
+the attempt.
+"""
 
 
 class FileInUse(BlockingIOError):
-    """Raised if the lock is held; ``process`` is the process ID of the owner, None if unknown."""
+    """Raised if the lock is held; ``process`` is the owner's process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -26,7 +27,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """Raised if the path of a lock file is a symbolic link, a folder, a pipe or a device."""
+    """Raised if a lock file's path is a symbolic link, a folder, a pipe or a device."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -47,7 +48,7 @@ class FileLock:
     def release(self) -> None:
         """Release the lock, and remove the file if this process created the lock. Call it only once.
 
-        The lock persists as long as a forked child that inherited it is running.
+        The lock persists while a forked child that inherited it is running.
         """
         if self.process == os.getpid():
             with contextlib.suppress(OSError):
@@ -56,7 +57,7 @@ class FileLock:
 
 
 def lock_file(path: Path) -> FileLock:
-    """Create the file ``path`` if necessary, lock it, and write the ID of this process into it.
+    """Create the file ``path`` if necessary, lock it, and write this process's ID into it.
 
     Returns:
         The lock; the caller must release it.

@@ -10,19 +10,20 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 MOST_BYTES: Final = 1 << 20
-"""Maximum size of a text file, bytes. This is ten times the size of the largest known file; parsers need
-about a hundred times as much memory as the text."""
+"""Maximum size of a text file, in bytes. This is ten times the size of the largest known file; parsers need
+about a hundred times as much memory as the text.
+"""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read a file, or a pipe that another process writes, as in ``<(command)``.
+    """Read a file, or a pipe written by another process, as in ``<(command)``.
 
-    A named pipe without a writer does not block; it counts as an empty file.
+    Reading a named pipe that has no writer does not block; the pipe counts as an empty file.
 
     Args:
         key: Option or key that specifies the file, for error messages.
         path: The file.
-        most_bytes: Maximum size, bytes.
+        most_bytes: Maximum size in bytes.
 
     Raises:
         ConfigError: The file cannot be read, or is larger than ``most_bytes``.
@@ -32,7 +33,7 @@ def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         with open(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise ConfigError(key, str(path), "a file that can be read (Is a directory)")
-            os.set_blocking(descriptor, True)  # only open() must not block
+            os.set_blocking(descriptor, True)  # only open() must be non-blocking
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None

@@ -11,7 +11,7 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written, before its content is computed.
+    """Check that a file can be written, before computing its content.
 
     Args:
         option: Option that specifies the file, for error messages.
@@ -31,7 +31,7 @@ def require_writable(option: str, file: Path) -> None:
 
 
 def write_text(option: str, file: Path, text: str) -> None:
-    """Write ``text`` in UTF-8 to ``file``, like :func:`write_bytes`.
+    """Write ``text`` to ``file`` as UTF-8, like :func:`write_bytes`.
 
     Raises:
         ConfigError: The file cannot be written; a regular file then keeps its old content.

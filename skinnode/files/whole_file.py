@@ -76,7 +76,7 @@ def discard(path: Path) -> None:
 
 
 def discard_leftovers(path: Path) -> None:
-    """Remove the temporary files of processes that were killed while writing ``path``.
+    """Remove temporary files left behind by processes that were killed while writing ``path``.
 
     No other process may be writing ``path`` at the same time.
     """

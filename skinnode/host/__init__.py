@@ -16,9 +16,9 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
     publish -> touch_changes (onsets and releases) -> health_watch -> events
 
 Other modules send SYNC (``sync``) and NMT commands (``nmt_master``), contain exceptions (``containment``),
-set the pauses between attempts (``retry_pause``) and pass frames to recorders (``tap``).
+set the pauses between retries (``retry_pause``) and pass frames to recorders (``tap``).
 
-**Containment.** An exception never ends a thread of the host. Its effect depends on what it concerns:
+**Containment.** An exception never ends a thread of the host. Its effect depends on where it occurs:
 
 - A patch: the patch is marked faulty, with the exception as the reason, and its scans are withheld. After a
   pause, the patch is brought up again. The pause starts at 0.1 s and doubles with each exception, up to 1 s.
@@ -85,7 +85,7 @@ __all__ = ["BringUpCancelled", "Condition", "HandFrame", "Host", "HostStats", "P
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use: many commands use parts of a host, but not the solver."""
+    """Import a public name on first use, because many commands use parts of the host but not the solver."""
     if name not in _HOME:
         raise AttributeError(f"module 'skinnode.host' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOME[name]), name)

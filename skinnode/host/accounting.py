@@ -1,4 +1,4 @@
-"""Check that the counters of a host add up: every frame and every scan must be accounted for.
+"""Check that a host's counters add up: every frame and every scan must be accounted for.
 
 The counters of a running host are read one after another, so the sums agree only if the host is idle or
 closed.
@@ -19,7 +19,7 @@ def discrepancies(stats: HostStats) -> list[str]:
     ===========  ==========================================================================================
     bus          frames read = received + ignored + error frames + dropped + waiting
     bus          received = foreign + handled; the PDOs of its patches are among the handled frames
-    bus          malformed = PDOs, SDO responses, heartbeats and EMCY messages of wrong length or format
+    bus          malformed = PDOs, SDO responses, heartbeats and EMCY messages with a wrong length or format
     patch        frames = accepted + duplicates + conflicts + late + wrong length, index, counter or format
     patch        assembled scans (complete, torn or unchecked) = offered + withheld + partial
     patch        offered = solved + failed + skipped
@@ -39,13 +39,13 @@ def discrepancies(stats: HostStats) -> list[str]:
     malformed = sum(bus.malformed for bus in stats.buses.values())
     if rejected > malformed:
         found.append(
-            f"got {rejected} PDOs of wrong length or form, must be at most the {malformed} malformed frames"
+            f"got {rejected} PDOs of wrong length or format, must be at most the {malformed} malformed frames"
         )
     return found
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss or error counter of a bus, by counter name."""
+    """Return a phrase for each of a bus's nonzero loss and error counters, keyed by counter name."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -57,7 +57,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss counter of a patch, by counter name."""
+    """Return a phrase for each of a patch's nonzero loss counters, keyed by counter name."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),

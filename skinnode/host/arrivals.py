@@ -14,14 +14,14 @@ REMEMBERED: Final = 8
 """Number of recent scans on which a prediction is based."""
 APART_NS: Final = 1_000_000
 """Maximum difference (ns) between scan ends that count as the same phase of the scan period. Stuff bits and
-the clock of the SYNC producer shift a scan end by less.
+the SYNC producer's clock shift a scan end by less than this.
 """
 MOST: Final = 3
 """Maximum number of predicted end times. If recent scans have ended at more phases, no prediction is made."""
 
 
 class ArrivalPredictor:
-    """Predictor of the end of a patch's next scan. Not thread-safe."""
+    """Predictor for the end of a patch's next scan. Not thread-safe."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -39,7 +39,7 @@ class ArrivalPredictor:
         period_ns, ends = self._period_ns, self._ends
         ends.appendleft(t_ns)
         due: list[int] = []
-        for end_ns in ends:  # newest first, because it predicts best
+        for end_ns in ends:  # newest first, because it is the best predictor
             due_ns = end_ns + ((t_ns - end_ns + period_ns // 2) // period_ns + 1) * period_ns
             for other_ns in due:
                 if -APART_NS < due_ns - other_ns < APART_NS:

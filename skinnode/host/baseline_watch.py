@@ -1,4 +1,4 @@
-"""Read the baseline or the error register of a running node again if it may have changed."""
+"""Reread a running node's baseline or error register if it may have changed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _DOUBT_NS: Final = 2_000_000_000
 
 _REGISTER_NS: Final = 500_000_000
 """Minimum interval (ns) between reads of a nonzero error register. With these reads, a patch is reported as
-operational within a second after its error has ended, even if the EMCY message that clears the error is lost.
-The reads take four SDO frames per second.
+operational within a second of its error ending, even if the EMCY message that clears the error is lost. The
+reads use four SDO frames per second.
 """
 
 
 class BaselineWatch:
-    """Reader of the baselines and error registers of running nodes. Used only by the supervisor's thread.
+    """Rereads the baselines and error registers of running nodes. Used only by the supervisor's thread.
 
     SDO transfers run as jobs on ``pool``. A node has at most one job at a time.
     """
@@ -36,7 +36,7 @@ class BaselineWatch:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Read a node's baseline again if the node has announced a new one or a summary was lost.
+        """Reread a node's baseline if the node has announced a new one or if a summary was lost.
 
         After an announcement, scans are withheld until the new baseline has been read.
         """
@@ -65,7 +65,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Read a nonzero error register again. The EMCY message that clears the error may have been lost."""
+        """Reread a nonzero error register. The EMCY message that clears the error may have been lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return

@@ -1,4 +1,4 @@
-"""Call a user's function with each field, on a thread of its own so that the host is not delayed."""
+"""Call a user's function with each field, on a dedicated thread so that the host is not delayed."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether the last call of the function has returned."""
+        """Whether the last call to the function has returned."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:

@@ -53,7 +53,7 @@ class Verdict:
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of the scan with the faults added.
+        """Return the scan's field with the faults added.
 
         If there is a reason for distrust, no wire of the field is trusted.
         """
@@ -71,7 +71,7 @@ FAULTLESS: Final = Verdict()
 
 
 class CodeWatch:
-    """Fault detector for the scans of one patch. Used only by the mainline.
+    """Fault detector for one patch's scans. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
@@ -94,7 +94,7 @@ class CodeWatch:
 
     @property
     def alive(self) -> Alive:
-        """State of the converter at the newest scan."""
+        """State of the converter as of the newest scan."""
         return self._life.alive
 
     @property

@@ -1,8 +1,8 @@
 """Configure a node: check its identity and layout, write its parameters, and read its baseline.
 
-A node-ID may belong to a different kind of device, such as a motor drive. The host therefore compares the
-identity and the layout of a node with the hand file before it writes anything. It reads back every parameter
-that it writes.
+A node-ID may belong to a different kind of device, such as a motor drive. The host therefore compares a
+node's identity and layout with the hand file before it writes anything. It reads back every parameter that it
+writes.
 
 On a bus that another master runs, the host sends no NMT commands and leaves the SYNC parameters unchanged. It
 writes a patch-specific parameter only if the node's value differs from the hand file. With
@@ -39,14 +39,14 @@ total.
 """
 
 HEARTBEATS_WATCHED: Final = 3
-"""Time without a heartbeat from the host after which a node stops sending scans, in heartbeat periods."""
+"""Number of heartbeat periods without a host heartbeat after which a node stops sending scans."""
 
 _POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configurator for the nodes of one bus.
+    """Configurator for the nodes on one bus.
 
     Threads: nodes may be configured in parallel, one thread per node.
     """
@@ -124,7 +124,7 @@ class Configurator:
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
-        """Check the identity object (0x1018). Return the serial number and the revision number."""
+        """Check the identity object (0x1018). Return the serial and revision numbers."""
         for subindex, what, expected in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
@@ -252,7 +252,7 @@ class Configurator:
         deadline.
 
         Returns:
-            (U, K) resistances at rest, ohm.
+            (U, K) resistances at rest, in ohms.
 
         Raises:
             NodeError: if the node does not keep the written baseline, or a resistance is not positive.
@@ -282,10 +282,10 @@ class Configurator:
         return baseline
 
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Read the baseline by block transfer, or value by value from a node without block transfer.
+        """Read the baseline by block transfer, or value by value if the node does not support block transfer.
 
         At 1 Mbit/s, a block transfer of 300 values takes 176 frames and 86 ms, limited by the rate at which
-        the node sends segments. Single reads take 600 frames and 75 ms plus the response times of the node.
+        the node sends segments. Single reads take 600 frames and 75 ms, plus the node's response times.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -315,7 +315,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
     reconfigures the node.
 
     Returns:
-        True if the node's values are those that the host would write.
+        True if the node has the values that the host would write.
 
     Raises:
         NodeError: if reading fails; see :class:`RemoteOd`.
@@ -341,7 +341,7 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Make the node monitor the host's heartbeat through entry 1 of object 0x1016.
+    """Make the node monitor the host's heartbeat, using entry 1 of object 0x1016.
 
     Two entries must not contain the same node-ID, so any other entry with the host's node-ID is cleared. The
     remaining entries are left unchanged.

@@ -1,8 +1,8 @@
-"""Contain exceptions in the threads of the host.
+"""Contain exceptions in the host's threads.
 
-An exception that concerns one patch, bus or subscriber does not affect the others, and the failed operation
-is retried. Each patch and each bus has its own record of exceptions, :class:`Defects`. The table in
-:mod:`skinnode.host` lists the effect of an exception in each thread.
+An exception in one patch, bus or subscriber does not affect the others, and the failed operation is retried.
+Each patch and each bus has its own record of exceptions, :class:`Defects`. The table in :mod:`skinnode.host`
+lists the effect of an exception in each thread.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ several patches or buses.
 """
 
 _COMPLAINTS: Final = 64
-"""Maximum number of messages that a record remembers as logged. A full record is cleared, so an earlier
-message may be logged again.
+"""Maximum number of logged messages that a record remembers. A full record is cleared, so an earlier message
+may be logged again.
 """
 
 
@@ -47,7 +47,7 @@ class DefectStats:
 
 
 class Defects:
-    """Record of the exceptions that concern ``subject``, such as a patch or a bus. Thread-safe.
+    """Record of the exceptions for one ``subject``, such as a patch or a bus. Thread-safe.
 
     An exception with a new message is logged on one line at level WARNING, logged with its traceback at level
     DEBUG, and passed to ``on_new``.
@@ -86,7 +86,7 @@ class Defects:
             self._logged.add(text)
         if known:
             return
-        with contextlib.suppress(Exception):  # a log handler of the application may raise
+        with contextlib.suppress(Exception):  # an application's log handler may raise
             _log.warning("%s: %s; retrying", self.subject, text)
             _log.debug("%s: %s", self.subject, text, exc_info=error)
         failure = SkinError(f"{self.subject}: {text}")
@@ -98,7 +98,7 @@ class Defects:
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
     """Call ``turn`` until it returns False.
 
-    An exception is reported to ``defects``. The next call follows after a pause of 1 to 20 ms.
+    An exception is reported to ``defects``. ``turn`` is called again after a pause of 1 to 20 ms.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

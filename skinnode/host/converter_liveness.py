@@ -1,4 +1,4 @@
-"""Decide whether the converter of a patch is running, from the conversion phase and from repeated codes.
+"""Determine from the conversion phase and from repeated codes whether a patch's converter is running.
 
 **Phase.** Some patches count their conversions and send the conversion phase
 (:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). A new phase proves that a conversion has taken
@@ -10,19 +10,19 @@ scans in which no code changes. A converter counts as stopped if all of these co
 
 - With the noise stated in the hand file, a running converter would produce such a run with a probability of
   at most ``FALSE_ALARM``.
-- With a lower noise, the probability is at most ``FALSE_ALARM_QUIET``. The lower noise is the stated noise
-  divided by ``QUIETER``, or half of the noise measured by :mod:`skinnode.host.noisy_and_drifting_wires` if
-  that is larger.
+- With lower noise, the probability is at most ``FALSE_ALARM_QUIET``. The lower noise is the stated noise
+  divided by ``QUIETER``, or half the noise measured by :mod:`skinnode.host.noisy_and_drifting_wires` if that
+  is larger.
 - The codes are known to be noisy: in at least ``FLICKERS`` earlier scans, a code has returned to the value it
   had before its last change.
-- The run is at least ``LONGER`` times as long as any earlier run of the running converter. Runs at rest and
-  runs under a press are compared separately: a converter that repeats its codes for minutes at rest may
-  repeat them for only two or three scans under a press.
+- The run is at least ``LONGER`` times as long as any earlier run while the converter was running. Runs at
+  rest and runs under a press are compared separately: a converter that repeats its codes for minutes at rest
+  may repeat them for only two or three scans under a press.
 
-**Doubt.** A few repeated scans do not prove that a converter has stopped, yet the fields may already show a
-press that is over. If all codes stop changing in mid-movement, the next ``DOUBT_RUN`` fields are therefore
-not trusted. This rule is limited to patches without a phase whose codes are noisy and have never all repeated
-before.
+**Doubt.** A few repeated scans do not prove that a converter has stopped, but the fields may still show a
+press that has ended. If all codes stop changing in the middle of a movement, the next ``DOUBT_RUN`` fields
+are therefore not trusted. This rule applies only to patches without a phase whose codes are noisy and have
+never all repeated before.
 
 If neither the phase nor the codes are conclusive and no code has changed for a second, the state is unknown
 (:attr:`Alive.CANNOT_TELL`).
@@ -48,42 +48,44 @@ _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
 _CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 
 FALSE_ALARM: Final = 1e-12
-"""False alarm probability of each test for a frozen crossing, wire or patch. A patch of 10 × 30 wires has 341
-tests per scan: 300 crossings, 40 wires and the patch. In ten hours at 100 scans/s, that makes 1.2e9 tests and
-about 0.001 false alarms.
+"""False alarm probability of each test for a frozen crossing, wire or patch. A patch with 10 × 30 wires
+requires 341 tests per scan: 300 crossings, 40 wires and the patch. Ten hours at 100 scans/s result in 1.2e9
+tests and about 0.001 false alarms.
 """
 FALSE_ALARM_QUIET: Final = 1e-8
-"""False alarm probability of the test for a frozen patch if its noise is only 1/``QUIETER`` of the stated
-noise. In ten hours (3.6e6 scans), such a patch has about 0.04 false alarms.
+"""False alarm probability of the frozen-patch test if the noise is only 1/``QUIETER`` of the stated noise. In
+ten hours (3.6e6 scans), such a patch causes about 0.04 false alarms.
 """
 QUIETER: Final = 10.0
 """Factor by which the noise stated in the hand file may exceed a converter's actual noise."""
 ABRUPT: Final = 16
-"""Threshold (codes) for the abrupt end of a movement. It applies to the largest code change in the last scan
-before the codes stop changing. The value has not been tuned.
+"""Threshold (codes) for detecting the abrupt end of a movement. It applies to the largest code change in the
+last scan before the codes stop changing. The value has not been tuned.
 """
 DOUBT_RUN: Final = 64
-"""Number of untrusted fields after the abrupt end of a movement. Most simulated converters that stopped in
+"""Number of untrusted fields after the abrupt end of a movement. Most simulated converters that stopped
 mid-press were detected within 11 scans, a few after more than 16.
 """
 FLICKERS: Final = 5
-"""Minimum number of scans in which a code returns to the value before its last change, for the codes of a
-patch to count as noisy.
+"""Minimum number of scans in which a code returns to its value before the last change, for a patch's codes to
+count as noisy.
 """
 LONGER: Final = 4
-"""Minimum length of a run that counts as frozen, as a multiple of the running converter's longest run."""
+"""Minimum length of a run that counts as frozen, as a multiple of the longest run while the converter was
+running.
+"""
 PROOF_NS: Final = 1_000_000_000
-"""Time (ns) for which a change in a code or in the phase proves that the converter is running."""
+"""Time (ns) for which a change in a code or the phase proves that the converter is running."""
 PHASES_REPEATED: Final = 3
-"""Number of scans without a new conversion after which a patch is reported as frozen. The same number of
-missed scans makes a patch stale. Even the field of the first such scan is not trusted.
+"""Number of scans without a new conversion after which a patch is reported as frozen. A patch also becomes
+stale after this number of missed scans. Even the field of the first such scan is not trusted.
 """
 _MOVED: Final = 16
 """Minimum distance (codes) from the rest code at which a resistance is assumed to be uniformly distributed
 within its quantization step.
 """
 _SPREAD: Final = 30
-"""Minimum number of distinct codes of a pressed patch that differ from the rest code by at least ``_MOVED``.
+"""Minimum number of distinct codes that differ from the rest code by at least ``_MOVED`` on a pressed patch.
 """
 
 
@@ -101,7 +103,7 @@ class Alive(enum.StrEnum):
 
 
 class ConverterLiveness:
-    """Detector of a stopped converter for one patch. Used only by the mainline.
+    """Stopped-converter detector for one patch. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
@@ -133,7 +135,7 @@ class ConverterLiveness:
 
     @property
     def doubtful(self) -> bool:
-        """Whether a movement ended abruptly at most ``DOUBT_RUN`` scans ago."""
+        """Whether a movement ended abruptly within the last ``DOUBT_RUN`` scans."""
         return self._abrupt and self._run <= DOUBT_RUN
 
     @property
@@ -143,7 +145,7 @@ class ConverterLiveness:
 
     @property
     def alive(self) -> Alive:
-        """State of the converter at the newest scan."""
+        """State of the converter as of the newest scan."""
         if self._same_phase >= PHASES_REPEATED or self._repeats_frozen():
             return Alive.NO
         if self._t_proof_ns is None or self._t_ns - self._t_proof_ns > PROOF_NS:
@@ -159,15 +161,15 @@ class ConverterLiveness:
             return f"its codes have not changed for {counted(self._run, 'scan')}"
         if self.doubtful:
             return (
-                "cannot tell whether its converter runs: its codes stopped changing in mid-movement, "
+                "cannot tell whether its converter is running: its codes stopped changing mid-movement, "
                 f"{counted(self._run, 'scan')} ago"
             )
         if self.alive is Alive.YES:
             return ""
         if self._t_proof_ns is None:
-            return "cannot tell whether its converter runs: no code has changed yet"
+            return "cannot tell whether its converter is running: no code has changed yet"
         still_s = (self._t_ns - self._t_proof_ns) * 1e-9
-        return f"cannot tell whether its converter runs: no code has changed for {still_s:.0f} s"
+        return f"cannot tell whether its converter is running: no code has changed for {still_s:.0f} s"
 
     def on_scan(
         self, scan: Scan, counts: tuple[int, int, int, int, int], last: NDArray[Any], run: NDArray[Any]
@@ -206,7 +208,7 @@ class ConverterLiveness:
     def _compare_phase(self, scan: Scan, *, unchanged: bool) -> None:
         phase = scan.phase
         if not phase:
-            # a summary without a phase: the patch does not count its conversions
+            # a summary without a phase means that the patch does not count its conversions
             if scan.device_time_us is not None:
                 self._phase = self._same_phase = 0
             return

@@ -1,6 +1,6 @@
-"""Count the frames of a bus and dispatch them to handlers by COB-ID, without threads or a clock.
+"""Count a bus's frames and dispatch them to handlers by COB-ID, without threads or a clock.
 
-A host feeds the dispatcher through a :class:`~skinnode.host.link.BusLink`, a replay from a recording.
+In a host, a :class:`~skinnode.host.link.BusLink` feeds the dispatcher; in a replay, a recording does.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ Handler = Callable[[bytes, int], None]
 _MARK_NS: Final = 100_000_000
 """Interval (ns) between updates of the bus load."""
 _MARKS: Final = 10
-"""Length of the moving average of the bus load, in units of ``_MARK_NS``."""
+"""Length of the bus load's moving average, in units of ``_MARK_NS``."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval (ns) between calls of the pollers. Their shortest timeout is 5 ms, so polling after each
+"""Minimum interval (ns) between calls to the pollers. Their shortest timeout is 5 ms, so polling after each
 batch, about once a millisecond, is unnecessary.
 """
 
@@ -49,7 +49,7 @@ class BusStats:
     ignored.
     """
     error_frames: int
-    """Number of error frames, with which the interface reports bus errors and controller states."""
+    """Number of error frames, which the interface uses to report bus errors and controller states."""
     bus_offs: int
     """Number of times the CAN controller has gone bus-off."""
     controller: BusState | None
@@ -57,7 +57,7 @@ class BusStats:
     foreign_ids: Mapping[int, int]
     """Number of foreign data frames by COB-ID."""
     read: int
-    """Number of frames read from the interface, of all types."""
+    """Number of frames of all types read from the interface."""
     waiting: int
     """Number of frames read from the interface but not dispatched yet."""
     kernel_dropped: int
@@ -78,7 +78,7 @@ class BusStats:
 
 @dataclass(frozen=True, slots=True)
 class PortCounters:
-    """Counters kept by the source of the frames, an interface or a recording."""
+    """Counters kept by the frame source, which is an interface or a recording."""
 
     sent: int = 0
     dropped: int = 0
@@ -90,7 +90,7 @@ class PortCounters:
 
 
 class Dispatcher:
-    """Dispatcher of the frames on one bus of the hand.
+    """Dispatcher for the frames on one bus of the hand.
 
     Threads: :meth:`count` and :meth:`count_sent` may be called from any thread, the other methods only from
     the mainline.
@@ -121,19 +121,19 @@ class Dispatcher:
 
         Args:
             cob_id: Identifier of the frames.
-            handler: Handler of the frames. It replaces any previous handler.
-            defects: Collector of the handler's exceptions; by default, that of the bus.
+            handler: Handler for the frames. It replaces any previous handler.
+            defects: Collector of the handler's exceptions; by default, the bus's collector.
         """
         if defects is not None:
             self._owners[cob_id] = defects
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch of frames, of all types, to ``listener`` before the handlers. Mainline only."""
+        """Pass each batch of frames, of all types, to ``listener`` before the handlers are called."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Stop passing batches of frames to ``listener``. Mainline only."""
+        """Stop passing batches of frames to ``listener``."""
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
@@ -141,7 +141,7 @@ class Dispatcher:
 
         Args:
             poller: Function to call, at most once every 2 ms.
-            defects: Collector of the poller's exceptions; by default, that of the bus.
+            defects: Collector of the poller's exceptions; by default, the bus's collector.
         """
         self._pollers = (*self._pollers, (poller, defects))
 
@@ -149,7 +149,7 @@ class Dispatcher:
         """Handle ``error``, raised during the operation ``doing``.
 
         Raises:
-            Exception: ``error`` itself, which stops a replay. On a live bus, the method is overridden.
+            Exception: ``error`` itself, which stops a replay. A live bus overrides this method.
         """
         raise error
 
@@ -157,7 +157,7 @@ class Dispatcher:
         """Ignore the predicted end times of scans. Only a live bus uses them."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
-        """Add a sent frame to the bus load. Any thread."""
+        """Add a sent frame to the bus load. Thread-safe."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
@@ -188,7 +188,7 @@ class Dispatcher:
                         continue
                     handler(data, t_ns)
                 going_on = False
-            except Exception as defect:  # ``frames`` goes on with the next frame
+            except Exception as defect:  # ``frames`` continues with the next frame
                 self.contain(self._owners.get(can_id), f"frame 0x{can_id:03X}", defect)
         try:
             self._tally(batch, others)
@@ -196,7 +196,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames of a batch. ``others`` are those of types that no handler accepts."""
+        """Count the frames of a batch. ``others`` are the frames whose type no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -232,7 +232,7 @@ class Dispatcher:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame. Log the first one of each COB-ID. Mainline only."""
+        """Count a malformed frame, and log it if it is the first with its COB-ID."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -245,10 +245,10 @@ class Dispatcher:
             )
 
     def count(self, port: PortCounters = PortCounters()) -> BusStats:
-        """Return all counters. Any thread.
+        """Return all counters. Thread-safe.
 
         Args:
-            port: Counters of the source of the frames.
+            port: Counters of the frame source.
         """
         return BusStats(
             received=self._received,
@@ -278,7 +278,7 @@ class Dispatcher:
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Update the bus load. Mainline only: the load meter is not thread-safe."""
+        """Update the bus load. Called only on the mainline, because the load meter is not thread-safe."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

@@ -1,7 +1,7 @@
 """Provide a bounded queue that never blocks the writer: a full queue drops its oldest items.
 
 The standard library has no such queue. A full ``queue.Queue`` blocks or rejects the new item.
-``collections.deque(maxlen=…)`` does not count the items it drops, and a reader cannot wait for an item.
+``collections.deque(maxlen=…)`` does not count the items it drops, and does not let a reader wait for an item.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """End marker of a queue, with the error that stopped the host, if any."""
+    """End marker of a queue; contains the error that stopped the host, if any."""
 
     error: SkinError | None = None
 
 
 class DropOldestQueue(Generic[T]):
-    """Queue of at most ``capacity`` items, ended by an :class:`End`. Thread-safe. Writing never blocks.
+    """Queue of at most ``capacity`` items, terminated by an :class:`End`. Thread-safe. Writing never blocks.
 
     The end marker is never dropped. :meth:`get` does not remove it, so every reader gets it.
     """
@@ -34,7 +34,7 @@ class DropOldestQueue(Generic[T]):
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:
-        """Append an item. Drop the oldest items beyond the capacity.
+        """Append an item. If this exceeds the capacity, drop the oldest items.
 
         Returns:
             Number of items dropped.
@@ -58,7 +58,7 @@ class DropOldestQueue(Generic[T]):
         """Remove and return the oldest item. An end marker is returned but not removed.
 
         Args:
-            timeout_s: Time limit (s); None for no limit, 0 to return at once.
+            timeout_s: Time limit (s); None for no limit, 0 to return immediately.
 
         Raises:
             queue.Empty: if no item arrives in time.

@@ -1,4 +1,4 @@
-"""Publish changes in the health of a hand as events, to subscribers and to the log."""
+"""Publish changes in a hand's health as events, to subscribers and to the log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GOOD: Final = frozenset(
     )
 )
 _NOTE: Final = frozenset(("booting", "boot_ups", "foreign", "noisy", "drifting", "left out"))
-"""Types of events that are not faults, or that may become faults."""
+"""Event types that are not faults, or are not faults yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,11 @@ class HealthEvent:
     """Change in the health of a patch, a bus or the host, or the onset or release of a touch."""
 
     t_ns: int
-    """Monotonic time of the change, ns. For a touch, this is the time of the scan that showed the change."""
+    """Monotonic time (ns) of the change. For a touch, this is the time of the scan that showed the change."""
     subject: str
     """Name of a patch or bus, or ``host``."""
     what: str
-    """Type of the change: for example ``touched``, ``released``, a new condition, the name of an increased
+    """Type of the change, for example ``touched``, ``released``, a new condition, the name of an increased
     counter of :class:`PatchHealth` or :class:`BusHealth`, or ``defects``.
     """
     text: str
@@ -57,7 +57,7 @@ class HealthEvent:
 
 
 class EventSubscription:
-    """Subscription to the events of a running host. Read it with ``for`` or :meth:`get`.
+    """Subscription to a running host's events. Read it with ``for`` or :meth:`get`.
 
     The iteration ends when the host closes. A full queue drops its oldest event; ``dropped`` counts these
     events. Any thread may read.
@@ -87,12 +87,12 @@ class EventSubscription:
             yield event
 
     def offer(self, event: HealthEvent | End) -> None:
-        """Queue an event or an end marker. Never blocks. Any thread."""
+        """Queue an event or an end marker. Never blocks. Thread-safe."""
         self.dropped += self._queue.put(event)
 
 
 class Events:
-    """Subscriptions to the events of a host. One thread may publish; any thread may subscribe."""
+    """Subscriptions to a host's events. One thread may publish; any thread may subscribe."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects

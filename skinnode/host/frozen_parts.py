@@ -6,7 +6,7 @@ or more crossings, the codes of both adjacent wires rise, or both fall, by at le
 of the neighbours' codes is called the lead (:mod:`skinnode.host.repeated_codes`). The criteria do not depend
 on the converter's noise.
 
-Both limits are based on simulated presses of patches without faults:
+Both limits are based on simulated presses on fault-free patches:
 
 - In 696 presses, the largest lead of a crossing whose code was constant for five scans was 75 codes.
 - In 1,800 presses without converter noise, the largest lead of a wire whose codes were constant for one scan
@@ -14,7 +14,7 @@ Both limits are based on simulated presses of patches without faults:
 
 **Noise.** A wire or crossing is also frozen if a running converter would produce its run with a probability
 of at most :data:`~skinnode.host.converter_liveness.FALSE_ALARM`. The assumed noise is a tenth of the stated
-noise, or half of the recently measured noise if that is larger. In addition, at least three quarters of the
+noise, or half the recently measured noise if that is larger. In addition, at least three quarters of the
 other crossings must have runs shorter than a quarter of this run. This second condition prevents false alarms
 if the converter has less noise than assumed, because then all crossings repeat their codes.
 
@@ -51,27 +51,28 @@ from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale
 
 CROSSING_LEAD: Final = 512
-"""Minimum lead (codes) of a frozen crossing: seven times the largest lead in 696 simulated presses without
-faults.
+"""Minimum lead (codes) of a frozen crossing: seven times the largest lead in 696 simulated presses on
+fault-free patches.
 """
 WIRE_LEAD: Final = 64
 """Minimum lead (codes) at ``LEADS`` crossings of a frozen wire: 2.5 times the largest lead in 1,800 simulated
-presses without faults.
+presses on fault-free patches.
 """
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings with a run shorter than a quarter of that of the frozen wire or
-crossing.
+"""Minimum fraction of the other crossings whose runs are shorter than a quarter of the frozen wire's or
+crossing's run.
 """
 
 
 class FrozenParts:
-    """Detector of frozen wires and crossings for one patch. Used only by the mainline.
+    """Detector for frozen wires and crossings on one patch. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
         relative_noise: Converter noise stated in the hand file, relative to the resistance.
-        state: State array of :mod:`skinnode.host.repeated_codes`. The detector sets its plane ``NAMED``.
+        state: State array of :mod:`skinnode.host.repeated_codes`. The detector sets the array's ``NAMED``
+            plane.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:
@@ -86,7 +87,7 @@ class FrozenParts:
         self.assume_noise(0.0, 0)
 
     def assume_noise(self, measured: float, least: int) -> None:
-        """Set the runs at which a wire or crossing may be frozen, according to the assumed noise.
+        """Set the run lengths at which a wire or crossing may be frozen, based on the assumed noise.
 
         Args:
             measured: Noise (codes) measured in the recent windows of scans; 0 if not measurable.
@@ -131,7 +132,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability of the run of a frozen wire; None if the wire is not frozen."""
+        """Return the log probability of a frozen wire's run; None if the wire is not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None
@@ -172,7 +173,7 @@ class FrozenParts:
 
 
 def _place(fault: DataFault) -> Any:
-    """Return the index of a fault's crossings in a (U, K) array."""
+    """Return the index that selects a fault's crossings in a (U, K) array."""
     return (
         slice(None) if fault.upper is None else fault.upper,
         slice(None) if fault.lower is None else fault.lower,

@@ -38,12 +38,12 @@ def load_baseline(path: Path, profile: PatchProfile) -> Float:
     """Read a patch's baseline from a text file.
 
     Returns:
-        (U, K) resistances at rest, ohm, rounded to REAL32.
+        (U, K) resistances at rest in ohms, rounded to REAL32.
 
     Raises:
         ConfigError: if the file is not a table of U × K positive numbers.
     """
-    allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
+    allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohms"
     text = read_input("baseline", path).decode("utf-8", "replace")
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -68,7 +68,7 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check an EDS file against the PDO format of a patch.
+    """Check an EDS file against a patch's PDO format.
 
     The file may describe the summary with or without the check over the codes.
 

@@ -38,12 +38,12 @@ class HandFrame:
     """
 
     scan: int
-    """Scan number of all fields: number of the SYNC, counted from the start of the host. It does not wrap
+    """Scan number of all fields: the SYNC number, counted from the start of the host. It does not wrap
     around.
     """
     t_sync_ns: int
     """Monotonic time (ns) of the SYNC; 0 if unknown. With staggered SYNC (``sync.stagger_ms``), the buses
-    have different SYNC times: this is the latest, and each field holds the time of its own bus.
+    have different SYNC times: this is the latest of them, and each field contains its own bus's time.
     """
     fields: Mapping[str, FieldFrame]
     """Fields by patch name."""
@@ -71,23 +71,23 @@ class HandFrame:
 
     @property
     def distrust(self) -> Mapping[str, str]:
-        """Human-readable reason for each patch that is not trusted, by patch name."""
+        """Human-readable reasons why patches are not trusted, by patch name."""
         reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
         return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
 
     @functools.cached_property
     def contacts(self) -> tuple[HandContact, ...]:
-        """Contacts on all patches in the frame of the hand, largest normal force first."""
+        """Contacts on all patches in the hand's frame, largest normal force first."""
         return tuple(each.moved(self.skeleton.link_pose(each.link)) for each in self._link_contacts)
 
     def contacts_on(self, link: str) -> tuple[HandContact, ...]:
-        """Return the contacts on a link in the frame of the link, largest normal force first.
+        """Return the contacts on a link in the link's frame, largest normal force first.
 
         Args:
             link: Name of the link; ``hand`` for the patches without a link.
 
         Raises:
-            ValueError: if the link carries no patch.
+            ValueError: if the link has no patch.
         """
         if link not in self.wrenches:
             raise ValueError(f"link: got {link!r}, must be one of {', '.join(map(repr, self.wrenches))}")
@@ -97,8 +97,8 @@ class HandFrame:
     def wrenches(self) -> Mapping[str, Wrench]:
         """Wrench on the skin of each link, by link name.
 
-        The torque is taken about the origin of the link's frame. Every link that carries a patch has an
-        entry, even without contact. The entry ``hand`` combines the patches without a link.
+        The torque is taken about the origin of the link's frame. Every link with a patch has an entry, even
+        if nothing touches it. The entry ``hand`` combines the patches without a link.
         """
         patches: dict[str, list[str]] = {}
         for patch in (*self.fields, *self.missing):
@@ -120,14 +120,14 @@ class HandFrame:
         return wrench_of(self.contacts, HAND, trusted=self.trusted)
 
     def at(self, link_poses: Mapping[str, Pose]) -> HandFrame:
-        """Return a copy with other link poses, for example from the current joint angles.
+        """Return a copy with different link poses, for example from the current joint angles.
 
         Args:
-            link_poses: Poses in the frame of the hand, by link name. Unlisted links keep their poses. Links
+            link_poses: Poses in the hand's frame, by link name. Unlisted links keep their poses. Links
                 without patches are ignored.
 
         Raises:
-            ValueError: if ``hand`` is listed. The frame of the hand is the reference and has no pose.
+            ValueError: if ``hand`` is listed. The hand's frame is the reference and has no pose.
         """
         if HAND in link_poses:
             raise ValueError(f"link_poses: got {HAND!r}, must be names of links; the hand has no pose")
@@ -136,7 +136,7 @@ class HandFrame:
 
     @functools.cached_property
     def _link_contacts(self) -> tuple[HandContact, ...]:
-        """Contacts on all patches, each in the frame of its link, largest normal force first."""
+        """Contacts on all patches, each in its link's frame, largest normal force first."""
         found = [
             HandContact.on_link(contact, patch, self.skeleton.mount(patch), trusted=each.trusted)
             for patch, each in self.fields.items()
@@ -146,16 +146,16 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Assembler of hand frames, which it returns in order of scan number. Not thread-safe.
+    """Assembles hand frames and returns them in order of scan number. Not thread-safe.
 
     A hand frame is ready when each awaited patch has delivered the field of this or a later scan. After
     :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames without its field, a patch is not
-    awaited until its next field arrives. At the latest, a hand frame is ready ``patience_ns`` after its first
+    awaited until its next field arrives. A hand frame is ready no later than ``patience_ns`` after its first
     field.
 
     Args:
         patches: Names of the patches.
-        patience_ns: Time limit (ns) for the other fields of a hand frame, counted from its first field.
+        patience_ns: Time limit (ns) for the other fields of a hand frame, measured from its first field.
         condition: Function that returns the condition of a patch.
         skeleton: Poses of the patches and links on the robot.
     """
@@ -190,7 +190,7 @@ class HandGatherer:
         self._until_ns.setdefault(stamp.scan, now_ns + self._patience_ns)
 
     def next(self, now_ns: int) -> HandFrame | None:
-        """Return the oldest hand frame if it is ready at ``now_ns``, else None."""
+        """Return the oldest hand frame if it is ready at ``now_ns``, otherwise None."""
         if not self._open:
             return None
         scan = min(self._open)
@@ -267,7 +267,7 @@ class HandSubscription(Closing):
         """Yield hand frames until the host closes.
 
         Raises:
-            TimeoutError: if no hand frame arrives within the timeout of the subscription.
+            TimeoutError: if no hand frame arrives within the subscription's timeout.
             SkinError: the error that stopped the host, if any.
         """
         while True:
@@ -312,7 +312,7 @@ class HandSubscription(Closing):
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time (s) until ``end_ns`` or the next deadline, whichever is first; else None."""
+        """Return the time (s) to the earlier of ``end_ns`` and the next deadline; None if neither is set."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 
@@ -321,7 +321,7 @@ class HandSubscription(Closing):
 
 
 def require_one_sync(hand: HandConfig) -> None:
-    """Check that one SYNC with a counter numbers the scans of all patches.
+    """Check that a single SYNC producer with a counter numbers the scans of all patches.
 
     Raises:
         ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.

@@ -21,8 +21,8 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 leaves this
-number open. Three periods tolerate one heartbeat delayed by a burst of frames and one destroyed by a bus
+"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 does not specify
+this number. Three periods tolerate one heartbeat delayed by a burst of frames and one destroyed by a bus
 error.
 """
 
@@ -62,7 +62,7 @@ class Condition(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Snapshot of the health of a patch.
+    """Snapshot of a patch's health.
 
     ``heartbeat_age_s`` and ``scan_age_s`` are the ages of the newest heartbeat and scan; None before the
     first one.
@@ -77,11 +77,11 @@ class PatchHealth:
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """Number of EMCY messages with an error since the host started."""
+    """Number of EMCY messages reporting an error since the host started."""
     last_emergency: int | None
-    """Error code of the newest EMCY message with an error; None before the first one."""
+    """Error code of the newest EMCY message reporting an error; None before the first one."""
     emergency_text: str
-    """Description of the newest EMCY message with an error; empty before the first one."""
+    """Description of the newest EMCY message reporting an error; empty before the first one."""
     error_register: int
     rejoins: int = 0
     """Number of times the node has been brought up again since the host started."""
@@ -106,9 +106,9 @@ class PatchHealth:
     life: str = ""
     """Human-readable reason to doubt that the converter is running; empty if there is none."""
     faults: tuple[DataFault, ...] = ()
-    """Faults found in the data of the newest field, each with part, first scan and certainty."""
+    """Faults found in the data of the newest field, each with its part, first scan and certainty."""
     defect: str | None = None
-    """Last host operation that raised an exception while serving the patch, with the exception; reset to None
+    """Last host operation that raised an exception while serving the patch, and the exception; reset to None
     by the next bring-up.
     """
     slow_overruns: int = 0
@@ -168,13 +168,13 @@ class PatchHealth:
 
 
 def faults_of(field: FieldFrame | None) -> tuple[DataFault, ...]:
-    """Return the faults in the data of a field; an empty tuple without a field."""
+    """Return the faults in a field's data; an empty tuple if ``field`` is None."""
     return () if field is None else field.faults
 
 
 @dataclass(frozen=True, slots=True)
 class BusHealth:
-    """Snapshot of the health of a bus. The counters start at 0 when the host starts."""
+    """Snapshot of a bus's health. The counters start at 0 when the host starts."""
 
     bus: str
     away: str | None
@@ -192,7 +192,7 @@ class BusHealth:
     """Number of frames with an unexpected COB-ID; ``foreign_ids`` lists these COB-IDs."""
     foreign_ids: tuple[int, ...]
     other_syncs: int
-    """Number of SYNC messages from another producer, on a bus where the host is the master."""
+    """Number of SYNC messages from another producer on a bus where the host is the master."""
     other_masters: int
     """Number of NMT commands, SDO requests to the hand's nodes, and heartbeats with the host's node-ID that
     came from other senders.

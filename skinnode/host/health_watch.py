@@ -1,4 +1,4 @@
-"""Watch the health of a running host and the touches of its patches, and publish changes as events."""
+"""Monitor a running host's health and its patches' touches, and publish changes as events."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval (s) between health checks. A change that lasts less than the interval may appear only in the
-counters.
-"""
+"""Interval (s) between health checks. A change shorter than this interval may appear only in the counters."""
 
 _QUIET_NS: Final = 1_000_000_000
 """Minimum interval (ns) between events for the same counter."""
@@ -30,7 +28,7 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, with the singular and any irregular plural for event texts."""
+"""Counters of :class:`PatchHealth`, each with the singular and any irregular plural for event texts."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -42,7 +40,7 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, with the singular and any irregular plural for event texts."""
+"""Counters of :class:`BusHealth`, each with the singular and any irregular plural for event texts."""
 
 
 def _monotonic_ns() -> int:
@@ -62,11 +60,11 @@ class HealthWatch:
     Args:
         patches: Function that returns the health of each patch.
         buses: Function that returns the health of each bus.
-        events: Where changes are published.
-        defects: Where exceptions are reported.
+        events: Destination of the published changes.
+        defects: Collector of the exceptions.
         all_defects: Function that returns the statistics of all contained exceptions.
         touches: Function that returns the onsets and releases since its last call.
-        now_ns: Function that returns the time of the checks, ns.
+        now_ns: Function that returns the time (ns) of a check.
     """
 
     def __init__(  # noqa: PLR0913 - what is watched, and by which clock
@@ -107,7 +105,7 @@ class HealthWatch:
         keep_on(self._turn, self._defects, "watching the health")
 
     def _turn(self) -> bool:
-        """Wait for the next check and carry it out. Return False after the last check.
+        """Wait for the next check and perform it. Return False after the last check.
 
         A check that raises an exception is repeated, so an event may be published twice but is never missed.
         """
@@ -190,7 +188,7 @@ class HealthWatch:
     ) -> None:
         for counter, words in counters.items():
             count = getattr(now, counter)
-            if not count:  # most counters of a healthy hand
+            if not count:  # true for most counters of a healthy hand
                 continue
             detail = ""
             if isinstance(now, BusHealth) and counter == "foreign":

@@ -47,15 +47,15 @@ class HostStats:
     """Counters of other masters' frames, by bus name."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
-    """First malformed frame of each bus that has received one."""
+    """First malformed frame received on each bus, if any."""
     defects: Mapping[str, DefectStats]
-    """Statistics of contained exceptions, by patch or bus name. The key ``host`` holds those that concern no
-    single patch or bus.
+    """Statistics of contained exceptions, by patch or bus name. The key ``host`` holds the exceptions that
+    concern no particular patch or bus.
     """
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
-        """Deprecated alias of :attr:`other_masters`, to be removed in version 0.2."""
+        """Deprecated alias for :attr:`other_masters`, to be removed in version 0.2."""
         warnings.warn(
             "HostStats.rivals is now HostStats.other_masters; the old name will be removed in version 0.2",
             DeprecationWarning,
@@ -65,7 +65,7 @@ class HostStats:
 
 
 class Host:
-    """Host of a running hand; the context manager :meth:`from_toml` or :meth:`from_config` creates it.
+    """Host of a running hand, created by the context manager :meth:`from_toml` or :meth:`from_config`.
 
     Example::
 
@@ -254,7 +254,7 @@ class Host:
         return self._publisher.latest(patch)
 
     def layout(self, patch: str) -> PatchLayout:
-        """Return the electrode layout with which a patch's fields are computed.
+        """Return the electrode layout used to compute a patch's fields.
 
         Raises:
             KeyError: if there is no such patch.
@@ -335,7 +335,7 @@ class Host:
         return untap
 
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
-        """Tare a patch: make its present resistances the baseline.
+        """Tare a patch: make its current resistances the baseline.
 
         The host commands the tare with RPDO1. The call returns once the host has read the new baseline and
         solves scans with it. Every event subscriber receives a ``baselines`` event. The node loses the new
@@ -363,7 +363,7 @@ class Host:
         )
 
     def reset_node(self, patch: str) -> None:
-        """Reset a patch's node (NMT *reset node*). The host brings the node up again when it has booted.
+        """Reset a patch's node (NMT *reset node*). Once the node has booted, the host brings it up again.
 
         Args:
             patch: Name of the patch.

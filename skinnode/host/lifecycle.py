@@ -87,14 +87,14 @@ class HostParts:
     callbacks: Callbacks
     events: Events
     defects: Defects
-    """Collector of the exceptions that concern no single bus or patch."""
+    """Collector of exceptions that concern no particular bus or patch."""
 
 
 @contextlib.contextmanager
 def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts]:
     """Start the parts of a host. Shut them down when the ``with`` block exits.
 
-    Order of the shutdown: stop SYNC, wait for the scans in progress, stop configuring nodes, make the nodes
+    Shutdown order: stop SYNC, wait for the scans in progress, stop configuring nodes, make the nodes
     pre-operational, end the mainline, discard queued scans, end the workers, close the interfaces, and end
     the subscriptions.
 
@@ -185,7 +185,7 @@ def _sync(
     nodes: Sequence[RemoteNode],
     stack: contextlib.ExitStack,
 ) -> SyncProducer | None:
-    """Send SYNC on the buses whose master is the host. Closing ``stack`` stops it."""
+    """Send SYNC on the buses where the host is the master. Closing ``stack`` stops it."""
     own = [bus for bus in buses.values() if bus.link.config.role == "master"]
     if not own:
         return None

@@ -1,6 +1,6 @@
-"""Determine the limitations of a hand: results that its hand file, its layouts or its noise rule out.
+"""Determine a hand's limitations: results ruled out by its hand file, layouts or noise.
 
-A limitation is not an error. ``skinnode hand check`` lists the limitations, to keep users from expecting more
+A limitation is not an error. ``skinnode hand check`` lists the limitations so that users do not expect more
 than the hand can deliver.
 """
 
@@ -24,7 +24,7 @@ from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
 """Standard deviation (fraction of the clearance) above which the resistances alone do not determine the
-displacements well enough. Few presses are deeper than this fraction.
+displacements well enough. Few presses are deeper than this fraction of the clearance.
 """
 
 
@@ -40,7 +40,7 @@ class Limitation:
     patches: tuple[str, ...]
     """Names of the patches."""
     key: str
-    """Key of the hand file that can be changed to remove the limitation."""
+    """Hand-file key that can be changed to remove the limitation."""
     text: str
     """Missing result, and the reason why it is missing."""
 
@@ -48,8 +48,8 @@ class Limitation:
 def limitations(hand: HandConfig) -> list[Limitation]:
     """Return the limitations of a hand. Patches with the same limitation share an entry.
 
-    The function compiles no kernels. It checks the deadline of the solver only if the kernels are compiled
-    already.
+    The function compiles no kernels. It checks the solver's deadline only if the kernels are already
+    compiled.
     """
     patches: dict[tuple[str, str], list[str]] = {}
     for patch in hand.patches:
@@ -59,7 +59,7 @@ def limitations(hand: HandConfig) -> list[Limitation]:
 
 
 def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str, str]]:
-    """Yield the key and text of each limitation of the solver for a patch."""
+    """Yield the key and text of each solver limitation for a patch."""
     layout = patch.layout.build()
     noise = math.hypot(patch.relative_noise, CodeScale(patch.code_bits).relative_std)
     options = tracker_options(patch, solver, relative_noise=noise)
@@ -77,7 +77,7 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
         yield (
             "solver.method",
             f"at a noise of {noise:.0e}, the exact inverse has errors of ± {share:.0%} of the clearance, "
-            'which is useless; method = "auto" uses the posterior',
+            'which are too large to be useful; method = "auto" uses the posterior',
         )
     if method == "exact" and not patch.tolerances.build().exact:
         yield (

@@ -37,7 +37,7 @@ class BusLink(Dispatcher, Closing):
 
     Args:
         config: Configuration of the bus.
-        handlers: Handlers of the data frames, by COB-ID. The mainline calls them.
+        handlers: Handlers for the data frames, by COB-ID. The mainline calls them.
         on_defect: Function called with each exception whose message is new, on the thread that raised it.
         open_port: Function that opens the interface.
 
@@ -78,7 +78,7 @@ class BusLink(Dispatcher, Closing):
         self.network = SkinNetwork(self.send)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a data frame. Any thread.
+        """Send a data frame. Thread-safe.
 
         Raises:
             BusError: if the interface does not accept the frame.
@@ -105,8 +105,8 @@ class BusLink(Dispatcher, Closing):
         Args:
             node_id: Node-ID of the node.
             on_answer: Function called with the monotonic time (ns) of each SDO response, on the mainline.
-            defects: Collector of the exceptions of the response handler; see :meth:`handle`. If given,
-                unexpected exceptions during a transfer are reported to the collector of the bus.
+            defects: Collector of the response handler's exceptions; see :meth:`handle`. If given, unexpected
+                exceptions during a transfer are reported to the bus's collector.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -123,7 +123,7 @@ class BusLink(Dispatcher, Closing):
         return RemoteOd(self.network, node_id, lambda error: self.defects.report(doing, error))
 
     def ask_remote(self, can_id: int) -> None:
-        """Send a remote frame, for example for node guarding. Any thread.
+        """Send a remote frame, for example for node guarding. Thread-safe.
 
         Raises:
             BusError: if the interface does not accept the frame.
@@ -139,15 +139,15 @@ class BusLink(Dispatcher, Closing):
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Stop passing sent frames to ``listener``. Mainline only."""
+        """Stop passing sent frames to ``listener``."""
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline, before any frame that arrives later is dispatched. Any thread.
+        """Run ``job`` on the mainline, before any frame that arrives later is dispatched. Thread-safe.
 
         Args:
             job: Function to run.
-            defects: Collector of the job's exceptions; by default, that of the bus.
+            defects: Collector of the job's exceptions; by default, the bus's collector.
         """
         self._jobs.append((job, self.defects if defects is None else defects))
 
@@ -215,7 +215,7 @@ class BusLink(Dispatcher, Closing):
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
-        """Dispatch one batch of frames. Return whether it contained any."""
+        """Dispatch one batch of frames. Return whether it contained any frames."""
         seen_ns = self.intake.seen_ns  # read first: the batch contains all frames up to this time
         batch = self.intake.take()
         while self._jobs:
@@ -224,8 +224,8 @@ class BusLink(Dispatcher, Closing):
                 job()
             except Exception as error:
                 owner.report("a job on the mainline", error)
-        # While frames are waiting, the pollers get the time of the newest dispatched frame. If they got the
-        # current time, a delay in the host would make nodes appear late.
+        # While frames are waiting, the pollers get the time of the newest dispatched frame. If they were
+        # given the current time, a delay in the host would make nodes appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns

@@ -38,7 +38,7 @@ to disk. For comparison, CANopenNode's LSS master waits 1 s for any response.
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
 """Time limits (s) for the response to a fastscan request, in the first and the second fastscan. The second,
-slower one runs only if the first has found no node.
+slower fastscan runs only if the first finds no node.
 """
 
 _TRIES: Final = 2
@@ -46,12 +46,12 @@ _TRIES: Final = 2
 """
 
 _SETTLE: Final = 0.2
-"""Pause after the first response to a fastscan request, as a fraction of the timeout. It leaves time for the
-responses of other slaves.
+"""Pause after the first response to a fastscan request, as a fraction of the timeout. It leaves time for
+other slaves' responses.
 """
 
 _UNDER_WAY_S: Final = 0.4
-"""Pause (s) that follows a timeout, long enough for a late response to arrive."""
+"""Pause (s) after a timeout, long enough for a late response to arrive."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
@@ -89,7 +89,7 @@ class LssMaster:
         """Make the patch with this serial number boot with ``node_id``.
 
         The patch does not store the node-ID: that is left to a technician. A patch that already has the
-        node-ID is left alone.
+        node-ID is left unchanged.
 
         Returns:
             Whether the patch was found and accepted the node-ID.
@@ -106,7 +106,7 @@ class LssMaster:
                     self.set_node_id(node_id)
             except LssFailed:
                 return False
-            finally:  # a slave that has received its first node-ID boots when released
+            finally:  # a slave that has just received its first node-ID boots when released
                 self.release()
             if active not in (None, node_id):
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
@@ -126,7 +126,7 @@ class LssMaster:
         return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
     def find_unconfigured(self) -> LssAddress | None:
-        """Find a node without a node-ID by fastscan.
+        """Use fastscan to find a node without a node-ID.
 
         The node stays in configuration state until :meth:`release` is called.
 
@@ -163,7 +163,7 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        # before the next request, wait for the responses of other slaves
+        # before the next request, wait for other slaves' responses
         if answer is not None:
             clock.sleep(answer_s * _SETTLE)
         return answer

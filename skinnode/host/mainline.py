@@ -16,7 +16,7 @@ from skinnode.transport import Receiver
 _WAIT_S: Final = 0.02
 """Maximum wait (s) for a frame before the pollers are called."""
 _ROUND_NS: Final = 10_000_000
-"""Maximum interval (ns) between iterations that serve all buses, also those without new frames."""
+"""Maximum interval (ns) between iterations that serve all buses, including those without new frames."""
 
 
 class Mainline:
@@ -29,7 +29,8 @@ class Mainline:
 
     Args:
         links: Connections to the buses.
-        defects: Collector of the exceptions that concern no single bus; by default, that of the first bus.
+        defects: Collector of exceptions that concern no particular bus; by default, the first bus's
+            collector.
     """
 
     def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:
@@ -48,7 +49,7 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the mainline threads and join them.
+        """Stop and join the mainline threads.
 
         Frames can still be sent afterwards.
         """
@@ -75,7 +76,7 @@ class Mainline:
         heard = self._receiver.wait(_WAIT_S)
         now_ns = clock.monotonic_ns()
         links: Sequence[BusLink] = self._links
-        if now_ns < self._round_ns:  # with many buses, most have received nothing
+        if now_ns < self._round_ns:  # if there are many buses, most have received nothing
             links = [self._by_intake[intake] for intake in heard]
         else:
             self._round_ns = now_ns + _ROUND_NS

@@ -12,23 +12,23 @@ from skinnode.protocol.profile import PatchProfile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeFacts:
-    """Facts about a patch, collected during the configuration of its node."""
+    """Facts about a patch, collected while its node is configured."""
 
     config: PatchConfig
     layout: PatchLayout
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) resistances at rest, ohm. The codes of the scans are relative to them."""
+    """(U, K) resistances at rest, in ohms. The scans' codes are relative to these."""
     serial: int | None
     """Serial number of the node; None if the host must not read it."""
     heartbeat_s: float
-    """Heartbeat period of the node, s."""
+    """Heartbeat period of the node, in seconds."""
     checked: bool = False
-    """Whether the summary of each scan contains a check over all codes; False if the revision number of the
-    node is unknown.
+    """Whether each scan's summary contains a check over all codes; False if the node's revision number is
+    unknown.
     """
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """Return a copy with another baseline."""
+        """Return a copy with a different baseline."""
         return replace(self, baseline_ohm=baseline_ohm)

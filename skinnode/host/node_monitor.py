@@ -1,4 +1,4 @@
-"""Evaluate the heartbeats and EMCY messages of a node, and derive the health of its patch."""
+"""Evaluate a node's heartbeats and EMCY messages, and derive the health of its patch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time (ns) for which a restart loop is reported after its last restart."""
+"""Time (ns) for which a restart loop continues to be reported after its last restart."""
 
 SETTLED_NS: Final = 500_000_000
 """Minimum time (ns) for which the condition stays *restarting* after the last restart in a loop, even if the
@@ -44,9 +44,9 @@ times the time that a single node needs to send them.
 
 
 class NodeMonitor:
-    """Collector of the evidence about one node.
+    """Collector of evidence about one node.
 
-    Threads: any thread may call :meth:`health`. The other methods are for the mainline only.
+    Threads: any thread may call :meth:`health`. Only the mainline may call the other methods.
 
     Args:
         patch: Name of the patch.
@@ -101,7 +101,7 @@ class NodeMonitor:
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Process a heartbeat or boot-up message. It must be one byte long."""
+        """Process a heartbeat or boot-up message, which must be one byte long."""
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
@@ -120,8 +120,8 @@ class NodeMonitor:
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY message.
 
-        The message holds the error code (u16), the error register (u8) and five manufacturer-specific bytes.
-        Error code 0 means that all errors have been cleared.
+        The message contains the error code (u16), the error register (u8) and five manufacturer-specific
+        bytes. Error code 0 means that all errors have been cleared.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
@@ -135,7 +135,7 @@ class NodeMonitor:
 
     @property
     def error_register(self) -> int:
-        """Error register of the node, as last reported."""
+        """Last reported error register of the node."""
         return self._error_register
 
     @property
@@ -177,9 +177,9 @@ class NodeMonitor:
         """Return the health of the patch.
 
         Args:
-            now_ns: Current monotonic time, ns.
-            heartbeat_s: Heartbeat period, s.
-            scan_s: Scan period, s.
+            now_ns: Current monotonic time (ns).
+            heartbeat_s: Heartbeat period (s).
+            scan_s: Scan period (s).
             conflicts: Number of frames that contradict another frame of the same scan.
             t_passed_ns: Monotonic arrival time (ns) of the newest scan that was not withheld; 0 if there is
                 none. None if scans are never withheld.
@@ -253,11 +253,11 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats arrive too often for a single node."""
+        """Return whether heartbeats arrive too often to come from a single node."""
         beats, period_ns = self._beats, heartbeat_s * 1e9
         if len(beats) < BEATS:
             return False
-        first_ns, last_ns = beats[0], beats[-1]  # never fewer, even if the mainline appends one concurrently
+        first_ns, last_ns = beats[0], beats[-1]  # appending does not shrink the deque
         if now_ns - last_ns > HEARTBEATS_MISSED * period_ns:
             return False
         return last_ns - first_ns < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns

@@ -26,7 +26,7 @@ periods.
 
 _PROBE_NS: Final = 250_000_000
 """Interval (ns) between requests to an absent node. The requests reveal a node that sends no heartbeats and
-whose boot-up message was lost. For four nodes, the requests take 0.1 % of a bus's capacity.
+whose boot-up message was lost. For four nodes, the requests use 0.1 % of a bus's capacity.
 """
 
 _SEARCH_NS: Final = 1_000_000_000
@@ -139,7 +139,7 @@ class NodeSupervision:
             remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if remote.has_other_master:  # the other master of the bus starts the node
+        if remote.has_other_master:  # the bus's other master starts the node
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:
@@ -182,7 +182,7 @@ class NodeSupervision:
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty after an unexpected exception.
 
-        If this method raises an exception itself, the next iteration calls it again.
+        If this method itself raises an exception, the next iteration calls it again.
         """
         remote = node.remote
         count = remote.defects.count
@@ -232,7 +232,7 @@ class NodeSupervision:
         if remote.link.t_dispatched_ns > max(said_ns, node.since_ns) + patience_ns and not remote.listen_only:
             _log.warning("node %d (%s) is lost: no heartbeat", remote.patch.node_id, remote.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            # until the node has been configured again
+            # scans are withheld until the node has been configured again
             remote.link.call(remote.stream.withhold, remote.defects)
             return
         if node.unconfigured:
@@ -255,7 +255,7 @@ def _read_back(node: Supervised) -> None:
 
 
 def _search(remote: RemoteNode) -> bool:
-    """Search for a node by LSS. Return whether it was found."""
+    """Search for a node over LSS. Return whether it was found."""
     try:
         return remote.search()
     except Exception as error:

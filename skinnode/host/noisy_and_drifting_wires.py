@@ -4,15 +4,15 @@ The tests for noise and drift evaluate windows of ``WINDOW`` successive scans. A
 been noisy, or drifting, in ``WINDOWS`` consecutive windows.
 
 **Noise.** The noise power of a wire is estimated from the second differences of its codes over time, which
-vanish for a steady change. A wire is noisy if its noise power exceeds ``NOISY`` times the expected noise
-power and ``NOISY`` times the median over the wires of its side.
+are zero for a steady change. A wire is noisy if its noise power exceeds ``NOISY`` times the expected noise
+power and ``NOISY`` times the median over all upper or all lower wires, respectively.
 
-**Drift.** A wire drifts if the resistances of all its crossings have changed by the same fraction of R0 and
+**Drift.** A wire drifts if the resistances of all its crossings have changed by the same fraction of R0 but
 those of the adjacent wires have not. The change must exceed ``DRIFT`` relative to R0 and relative to the
 median wire. A touch does not meet these conditions: it changes the crossings of a wire unevenly, and the
 rubber carries the change to the adjacent wires. None of 780,000 simulated touches that changed a wire by more
-than ``DRIFT`` was taken for drift. The test misses a drift that adjacent wires share and the drift of a wire
-that is being touched.
+than ``DRIFT`` was mistaken for drift. The test misses drift that affects adjacent wires equally, and drift of
+a wire that is being touched.
 """
 
 from __future__ import annotations
@@ -33,22 +33,23 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy, or drifting, to be reported."""
 NOISY: Final = 25.0
-"""Minimum noise power of a noisy wire, relative to the median over the wires of its side. This corresponds to
-5 times the median noise amplitude.
+"""Minimum noise power of a noisy wire, relative to the median over all upper or all lower wires. This
+corresponds to 5 times the median noise amplitude.
 """
 DRIFT: Final = 1e-3
-"""Minimum change in a drifting wire, as a fraction of R0. A light touch changes a crossing ten times as much.
+"""Minimum change in a drifting wire, as a fraction of R0. Even a light touch changes a crossing ten times as
+much.
 """
 UNEVEN: Final = 0.05
-"""Maximum deviation of the crossings of a drifting wire from their median, as a fraction of the drift."""
+"""Maximum deviation of a drifting wire's crossings from their median, as a fraction of the drift."""
 APART: Final = 0.3
 """Minimum difference in R/R0 between a drifting wire and each adjacent wire, as a fraction of the drift."""
 _SHOWN: Final = 8
-"""Number of recent windows from which :attr:`WireWindows.shown_noise` is determined."""
+"""Number of recent windows used to determine :attr:`WireWindows.shown_noise`."""
 
 
 class WireWindows:
-    """Detector of noise and drift in the wires of one patch. Used only by the mainline.
+    """Detector for noise and drift in one patch's wires. Used only by the mainline.
 
     Args:
         scale: Mapping of R/R0 to codes.
@@ -61,19 +62,19 @@ class WireWindows:
         """Wires currently reported as noisy or drifting."""
         self.windows = 0
         """Number of windows evaluated so far."""
-        self._odd: dict[WireFault, int] = {}  # number of consecutive windows, by fault
+        self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
         self._window: list[Codes] = []
-        # crossings measured in every scan of the window, as a mask; None if that is all of them
+        # mask of the crossings measured in every scan of the window; None if all were measured
         self._measured: NDArray[np.bool_] | None = None
         self._shown: deque[float] = deque(maxlen=_SHOWN)
 
     @property
     def shown_noise(self) -> float:
-        """Smallest noise (codes) of the recent windows; 0 if it was not measurable in one of them."""
+        """Smallest noise (codes) in the recent windows; 0 if the noise was not measurable in one of them."""
         return min(self._shown) if len(self._shown) == _SHOWN else 0.0
 
     def on_scan(self, scan: Scan) -> None:
-        """Add the next scan. It must contain the codes of all crossings."""
+        """Add the next scan, which must contain the codes of all crossings."""
         if not scan.valid.all():
             self._measured = scan.valid if self._measured is None else self._measured & scan.valid
         self._window.append(scan.codes)
@@ -119,7 +120,7 @@ class WireWindows:
 
 
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
-    """Return the lower quartile of the noise over the crossings (codes); 0 if it is not measurable.
+    """Return the lower quartile (codes) of the noise over the crossings; 0 if it is not measurable.
 
     A crossing counts as noiseless if its codes span fewer than three values. Two values are not enough,
     because even without noise a resistance at the edge of a quantization step may alternate between two
@@ -128,7 +129,7 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
-        power: (U, K) mean square of the noise, codes²; NaN where a code is not a measurement.
+        power: (U, K) mean square of the noise, in codes²; NaN where a code is not a measurement.
     """
     half = WINDOW // 2
     moved = np.abs(codes[half:].mean(axis=0) - codes[:half].mean(axis=0))
@@ -138,7 +139,7 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the median of values without NaN, for small arrays in a third of the time of ``np.median``."""
+    """Return the median of values without NaN; three times as fast as ``np.median`` for small arrays."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle

@@ -16,14 +16,14 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Minimum gap (ns) between two frames of one type from other masters for the second to be logged."""
+"""Minimum time (ns) between two frames of the same type from other masters for the second to be logged."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"
 
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Counters of the frames received from other masters.
+    """Counters of frames received from other masters.
 
     On a bus that another master runs, SYNC and NMT commands are legitimate: ``syncs`` and ``nmt_commands``
     stay 0.
@@ -34,13 +34,13 @@ class OtherMasterStats:
     sdo_requests: int
     """Number of SDO requests to the hand's nodes, for example from a second host or a service tool."""
     heartbeats: int
-    """Number of heartbeats with the node-ID of the host."""
+    """Number of heartbeats with the host's node-ID."""
     last_ns: int | None
     """Monotonic time (ns) of the newest frame from another master; None before the first one."""
 
 
 class OtherMasters:
-    """Detector of other masters on one bus. It logs the first frame of each type. Mainline only."""
+    """Detector for other masters on one bus. It logs the first frame of each type. Used by the mainline."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -48,7 +48,7 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """Return the handlers that count the frames of other masters, by COB-ID.
+        """Return the handlers that count other masters' frames, by COB-ID.
 
         On a bus that another master runs, there is no handler for SYNC and NMT commands.
 
@@ -67,7 +67,7 @@ class OtherMasters:
         return handlers
 
     def stats(self) -> OtherMasterStats:
-        """Return all counters. Any thread."""
+        """Return all counters. Thread-safe."""
         counts = self._counts
         last_ns = max(self._last_ns.values(), default=None)
         return OtherMasterStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)

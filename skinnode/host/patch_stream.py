@@ -1,8 +1,8 @@
-"""Turn the chunks of a patch into fields.
+"""Turn a patch's chunks into fields.
 
 The mainline assembles each scan and puts it into a one-element buffer, the *box*. A worker thread takes the
-scan from the box, decodes it and solves it. A scan that is replaced in the box by a newer one is counted as
-skipped. A token limits each stream to one worker at a time.
+scan from the box, decodes it and solves it. If a newer scan replaces it in the box, the older scan is counted
+as skipped. A token limits each stream to one worker at a time.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ priority, because applications are waiting for the fields of all patches.
 class StreamStats:
     """Counters of a patch's scans.
 
-    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan ends as
-    ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
+    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan is finally
+    counted as ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
     """
 
     frames: int
@@ -61,14 +61,14 @@ class StreamStats:
     untrusted: int
     """Number of untrusted fields."""
     invalid_codes: int
-    """Number of codes in all solved scans that mark a crossing as over range, short, open or missing."""
+    """Number of codes, over all solved scans, that mark a crossing as over range, short, open or missing."""
     assembler: AssemblerStats
     failed: int = 0
     """Number of scans whose decoding or solving raised an exception."""
 
 
 class StreamTap(Protocol):
-    """Recorder of the events, apart from received frames, that decide which scans are solved.
+    """Recorder of the events, apart from received frames, that determine which scans are solved.
 
     All methods are called on the mainline.
     """
@@ -91,13 +91,13 @@ def _ignore(scan: Scan) -> None:
 
 
 def _find_nothing(scan: Scan, number: int) -> Verdict:
-    """Return a verdict without faults; default of :attr:`StreamOptions.judge`."""
+    """Return a fault-free verdict; default of :attr:`StreamOptions.judge`."""
     return FAULTLESS
 
 
 @dataclass(frozen=True, slots=True)
 class StreamOutput:
-    """Destinations of a stream's scans, fields and exceptions."""
+    """Destinations for a stream's scans, fields and exceptions."""
 
     workers: Workers | Inline
     publisher: Publisher
@@ -118,11 +118,13 @@ class StreamOptions:
     has been called with all earlier scans, so a replay gives the same verdicts as the host.
     """
     watch: Callable[[Scan], None] = _ignore
-    """Function called with each assembled scan after :data:`WATCH_AFTER_NS`, or at the next scan."""
+    """Function called with each assembled scan after :data:`WATCH_AFTER_NS`, or when the next scan
+    arrives.
+    """
     partial: Partial = "pass"
     """Treatment of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node. Scans may then be under way when the stream is resumed."""
+    """Whether another master starts the node. If so, scans may be under way when the stream is resumed."""
 
 
 class PatchStream:
@@ -131,8 +133,8 @@ class PatchStream:
     Scans are withheld until :meth:`resume` sets a solver. If decoding or solving raises an exception, only
     the current scan is lost.
 
-    Threads: any thread may call :meth:`settled` and :meth:`stats`. The other public methods are for the
-    mainline only.
+    Threads: any thread may call :meth:`settled` and :meth:`stats`. Only the mainline may call the other
+    public methods.
     """
 
     def __init__(
@@ -214,12 +216,12 @@ class PatchStream:
         return self._solver is None
 
     def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
-        """Decode and solve the following scans with ``solver``.
+        """Decode and solve subsequent scans with ``solver``.
 
         Args:
             solver: Solver for the scans.
-            withholdings: Value of ``withholdings`` that the caller has last seen. If :meth:`withhold` has
-                been called since, :meth:`resume` has no effect.
+            withholdings: Value of ``withholdings`` last seen by the caller. If :meth:`withhold` has been
+                called since then, :meth:`resume` has no effect.
             anew: Whether the node has restarted. If so, the frames received so far are discarded.
         """
         if withholdings != self.withholdings:
@@ -297,7 +299,7 @@ class PatchStream:
 
         Args:
             times_ns: Monotonic arrival times (ns) of the last frames of the skipped scans.
-            within_ns: Tolerance (ns) of the comparison.
+            within_ns: Tolerance (ns) for the comparison.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 

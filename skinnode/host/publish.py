@@ -1,4 +1,4 @@
-"""Pass fields from the worker threads to the bounded queues of the subscribers."""
+"""Pass fields from the worker threads to the subscribers' bounded queues."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def check_timeout(timeout_s: float | None) -> None:
     """Check a timeout.
 
     Raises:
-        ValueError: if the timeout is negative, not a number, or above the limit of the operating system.
+        ValueError: if the timeout is negative, not a number, or above the operating system's limit.
     """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
 
 
 def check_capacity(capacity: int) -> None:
-    """Check the capacity of a queue.
+    """Check a queue's capacity.
 
     Raises:
         ValueError: if the capacity is not an integer of at least 1.
@@ -41,16 +41,16 @@ def check_capacity(capacity: int) -> None:
 class Subscription(Closing):
     """Subscription to fields. Read it with ``for``, ``async for`` or :meth:`get`.
 
-    Fields are delivered in the order of publication. A full queue drops its oldest field; ``dropped`` counts
-    these fields. A subscription accepts fields until it is closed, its ``with`` block exits or the last
-    reference to it is deleted. Any thread or event loop may read it.
+    Fields are delivered in publication order. A full queue drops its oldest field; ``dropped`` counts these
+    fields. A subscription accepts fields until it is closed, its ``with`` block exits or the last reference
+    to it is deleted. Any thread or event loop may read it.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._subscribed = patches
-        # One counter per patch, because only one worker at a time publishes the fields of a patch.
+        # One counter per patch, because only one worker at a time publishes a patch's fields.
         self._dropped = dict.fromkeys([*patches, ""], 0)
         self._wakers: dict[object, Callable[[], object]] = {}  # one wake-up function per waiting task
 
@@ -118,7 +118,7 @@ class Subscription(Closing):
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields, and end the reader's loop after the last queued field. Any thread."""
+        """Stop accepting fields, and end the reader's loop after the last queued field. Thread-safe."""
         self.close()
         self.offer(End(), "")
 
@@ -126,7 +126,7 @@ class Subscription(Closing):
         """Yield fields until the host closes.
 
         Raises:
-            TimeoutError: if no field arrives within the timeout of the subscription.
+            TimeoutError: if no field arrives within the subscription's timeout.
             SkinError: the error that stopped the host, if any.
         """
         while True:
@@ -153,7 +153,7 @@ class Subscription(Closing):
         return TimeoutError(f"no field within {self._timeout_s} s")
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue a field of a subscribed patch, or an end marker. Any thread.
+        """Queue a field of a subscribed patch, or an end marker. Thread-safe.
 
         Never blocks.
         """
@@ -176,7 +176,7 @@ class Subscription(Closing):
 
 
 class Publisher:
-    """Subscriptions of a host, and the newest field of each patch.
+    """A host's subscriptions, and the newest field of each patch.
 
     If passing a field to a subscriber raises an exception, only that subscriber loses the field. The
     exception is reported to ``defects``.
@@ -209,7 +209,7 @@ class Publisher:
         chosen = self._patches if patch is None else frozenset([patch])
         subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
-        # No lock is needed: setting and removing an item of a dict are atomic, and readers copy the dict.
+        # No lock is needed: setting and removing dict items is atomic, and readers copy the dict.
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:
@@ -246,7 +246,7 @@ class Publisher:
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """End every subscription after its queued fields, because the host closes."""
+        """End every subscription after its queued fields, because the host is closing."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

@@ -1,6 +1,6 @@
-"""Register the handlers of a host for the frames on a bus.
+"""Register a host's handlers for the frames on a bus.
 
-The functions of this module send no frames, start no threads and never block, so a replay can use them for
+The functions in this module send no frames, start no threads and never block, so a replay can use them for
 recorded frames.
 """
 
@@ -32,7 +32,7 @@ SYNC period, because the chunks of all patches take precedence over the summary 
 
 @dataclass(frozen=True, slots=True)
 class PatchReception:
-    """Receivers of the frames of a patch."""
+    """Receivers of a patch's frames."""
 
     stream: PatchStream
     monitor: NodeMonitor
@@ -40,14 +40,14 @@ class PatchReception:
 
 @dataclass(frozen=True, slots=True)
 class BusReception:
-    """Receivers of the frames of other masters on a bus."""
+    """Receivers of other masters' frames on a bus."""
 
     other_masters: OtherMasters
     follower: SyncFollower
 
 
 def receive_bus(hand: HandConfig, dispatcher: Dispatcher, ticks: Ticks) -> BusReception:
-    """Register the handlers for the frames of other masters on a bus."""
+    """Register the handlers for other masters' frames on a bus."""
     config = dispatcher.config
     other_masters, follower = OtherMasters(config), SyncFollower(ticks)
     for cob_id, handler in other_masters.handlers(
@@ -67,9 +67,9 @@ def receive_patch(
     ticks: Ticks,
     output: StreamOutput,
 ) -> PatchReception:
-    """Register the handlers for the frames of a patch.
+    """Register the handlers for a patch's frames.
 
-    The stream withholds scans until it has a solver. Scans may arrive at once if an earlier host has left the
+    The stream withholds scans until it has a solver. Scans may arrive immediately if a previous host left the
     node operational.
 
     Args:
@@ -77,8 +77,8 @@ def receive_patch(
         hand: Configuration of the hand to which the patch belongs.
         dispatcher: Dispatcher of the patch's bus.
         ticks: SYNC times of the patch's bus.
-        output: Workers and publisher for the patch's scans, and collector of the exceptions. Without a
-            collector, handlers raise their exceptions, and an exception in the solver stops the publisher.
+        output: Workers and publisher for the patch's scans, and collector of exceptions. Without a collector,
+            handlers raise their exceptions, and an exception in the solver stops the publisher.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
@@ -125,4 +125,4 @@ def receive_patch(
 
 
 def _ignore(data: bytes, t_ns: int) -> None:
-    """Ignore an NMT command of the bus's master."""
+    """Ignore an NMT command from the bus's master."""

@@ -42,7 +42,7 @@ class RemoteNode:
     """Patch of the hand and its CANopen node, as seen by the host.
 
     Threads: one thread at a time, other than the mainline, may bring up the node. Only that thread may call
-    the methods that are not marked "Any thread".
+    the methods that are not marked as thread-safe.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class RemoteNode:
 
     @property
     def heartbeat_s(self) -> float:
-        """Heartbeat period of the node, s."""
+        """Heartbeat period of the node, in seconds."""
         return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
 
     def configure(
@@ -139,7 +139,7 @@ class RemoteNode:
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
     def start(self, solver: ScanSolver, withholdings: int) -> None:
-        """Pass the following scans to ``solver``. If the host is the NMT master, start the node.
+        """Pass subsequent scans to ``solver``. If the host is the NMT master, start the node.
 
         Args:
             solver: Solver for the node's scans.
@@ -160,7 +160,8 @@ class RemoteNode:
         """Read the node's current baseline. Create a new solver if needed.
 
         Returns:
-            Solver with the baseline read; None if the baseline is unchanged and no scans are withheld.
+            Solver with the baseline that was read; None if the baseline is unchanged and no scans are
+            withheld.
 
         Raises:
             SkinError: for the reasons listed under :meth:`Configurator.settle_baseline`.
@@ -204,7 +205,7 @@ class RemoteNode:
         return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
-        """Command the node to tare. Any thread.
+        """Command the node to tare. Thread-safe.
 
         Raises:
             SkinError: for the reasons listed under :meth:`Host.tare`.
@@ -212,7 +213,7 @@ class RemoteNode:
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:
             raise NodeError(node_id, f"{said}: another master runs the bus")
-        if self.patch.baseline is not None:  # the host would restore the baseline from the file at once
+        if self.patch.baseline is not None:  # the host would immediately restore the baseline from the file
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if (
             not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
@@ -266,11 +267,11 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the host is the NMT master and knows the serial number, as a search by LSS requires."""
+        """Whether the host is the NMT master and knows the serial number, as an LSS search requires."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the node by LSS with its serial number. Return whether it was found.
+        """Search for the node over LSS, by serial number. Return whether it was found.
 
         A node that is found boots with the node-ID from the hand file.
         """

@@ -2,10 +2,10 @@
 
 A reading repeats the previous code with a probability of at most 2Φ(1/2σ) − 1, where σ is the standard
 deviation of the noise in codes. This maximum is reached if the true value lies in the middle of a
-quantization step, as for skin at rest after a tare.
+quantization step, as it does at rest after a tare.
 
 Under a press, the crossings have different values, whose positions within their quantization steps are
-practically random. For a random position, n + 1 readings of one crossing all give the same code with the
+practically random. For a random position, n + 1 readings of one crossing all give the same code with
 probability E max(0, 1 − σ R), where R is the range of n + 1 standard normal variables. This is much less than
 the maximum, even for a converter with little noise.
 """
@@ -17,8 +17,8 @@ import math
 from typing import Final
 
 _EDGES: Final = 0.1
-"""Upper limit to which larger values of σ are reduced. Up to this limit, σ R < 1 for all relevant runs and E
-max(0, 1 − σ R) = 1 − σ E R.
+"""Upper limit for σ; larger values are clipped. Up to this limit, σ R < 1 for all relevant runs and E max(0,
+1 − σ R) = 1 − σ E R.
 """
 
 
@@ -26,7 +26,7 @@ def log_stay(sigma: float) -> float:
     """Return the logarithm of the maximum probability that a reading repeats the previous code.
 
     Args:
-        sigma: Standard deviation of the noise, codes.
+        sigma: Standard deviation (codes) of the noise.
     """
     if sigma <= 0.0:
         return 0.0
@@ -40,7 +40,7 @@ def log_stay_anywhere(sigma: float, run: int) -> float:
     The position of the true value within its quantization step is assumed to be random.
 
     Args:
-        sigma: Standard deviation of the noise, codes.
+        sigma: Standard deviation (codes) of the noise.
         run: Number of repetitions.
     """
     return math.log1p(-min(sigma, _EDGES) * _mean_range(run + 1))
@@ -58,7 +58,7 @@ def _mean_range(count: int) -> float:
 
 
 def deviations_of(log_p: float) -> float:
-    """Return the value that a standard normal variable exceeds with the probability exp(``log_p``)."""
+    """Return the value that a standard normal variable exceeds with probability exp(``log_p``)."""
     if log_p > -1.0:
         return 0.0
     z = math.sqrt(-2.0 * log_p)

@@ -32,11 +32,11 @@ _PLANES: Final = 10
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
 """Indices of the limits:
 
-- ``UPPER``, ``LOWER``, ``CROSSING``: run at which an upper wire, a lower wire or a crossing may be frozen.
-- ``WIRE_LEAD``, ``CROSSING_LEAD``: lead at which a wire or crossing with repeated codes may be frozen.
+- ``UPPER``, ``LOWER``, ``CROSSING``: minimum run of a possibly frozen upper wire, lower wire or crossing.
+- ``WIRE_LEAD``, ``CROSSING_LEAD``: minimum lead of a possibly frozen wire or crossing.
 - ``STEPS``: highest code that is a measurement.
-- ``FRESH``: 1 if the node sent every code of the scan, 0 if it left out unchanged codes. Runs grow only if it
-  is 1.
+- ``FRESH``: 1 if the node sent every code of the scan, 0 if it left out unchanged codes. Runs grow only if
+  ``FRESH`` is 1.
 """
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
 """Indices of the results:
@@ -47,7 +47,7 @@ MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range
 - ``LARGEST``: largest change in a code.
 - ``RESERVED``: number of crossings whose newest code is reserved.
 - ``LEAST``: smallest code that is a measurement.
-- ``RELEASED``: number of crossings reported as frozen whose code has changed.
+- ``RELEASED``: number of crossings reported as frozen whose codes have changed.
 - ``SUSPECT``: 1 if another wire or crossing may be frozen, 0 otherwise.
 """
 
@@ -127,13 +127,13 @@ def _update_leads(state: _Int, steps: int) -> None:
 
 @njit_part
 def _one(here: int) -> int:
-    """Return the number of the first neighbour of wire ``here``."""
+    """Return the index of the first neighbour of wire ``here``."""
     return 1 if here == 0 else here - 1
 
 
 @njit_part
 def _two(here: int, size: int) -> int:
-    """Return the number of the second neighbour of wire ``here``, of ``size`` parallel wires."""
+    """Return the index of the second neighbour of wire ``here`` among ``size`` parallel wires."""
     if here == 0:
         return 2
     return size - 3 if here == size - 1 else here + 1
@@ -167,7 +167,7 @@ def _any_crossing(state: _Int, limits: _Int) -> bool:
     """Return whether any crossing may be frozen.
 
     A repeated code is suspicious if the codes of all four neighbours have moved during the run, or if the run
-    is long and most other crossings have much shorter ones.
+    is long and most other crossings have much shorter runs.
     """
     known = still = longest = 0
     lead = limits[CROSSING_LEAD]
@@ -189,7 +189,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
     """Return whether any wire may be frozen.
 
     A wire with repeated codes is suspicious if the codes of the adjacent wires have moved during the run, or
-    if the run is long and most other crossings have much shorter ones.
+    if the run is long and most other crossings have much shorter runs.
     """
     for side in range(2):
         wires, others = state.shape[1 + side], state.shape[2 - side]

@@ -1,4 +1,4 @@
-"""Determine the pauses between attempts at a failed operation, such as bringing up a node."""
+"""Determine the pauses between retries of a failed operation, such as bringing up a node."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ to the longest.
 
 
 class Pause:
-    """Sequence of increasing pauses between attempts at a failed operation.
+    """Sequence of increasing pauses between retries of a failed operation.
 
-    The sequence restarts at a failure that occurs more than ``longest_s`` after the end of the previous
-    pause.
+    The sequence restarts if a failure occurs more than ``longest_s`` after the end of the previous pause.
     """
 
     def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:

@@ -1,4 +1,4 @@
-"""Decode the scans of a patch into resistances, and solve them for fields."""
+"""Decode a patch's scans into resistances, and compute fields from them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class ScanSolver:
     Args:
         facts: Layout, code scale and baseline of the patch.
         config: Settings of the solver.
-        now: Function that returns the monotonic time, ns.
-        period_s: SYNC period of the hand, s.
+        now: Function that returns the monotonic time (ns).
+        period_s: SYNC period (s) of the hand.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class ScanSolver:
 
         Args:
             scan: The scan.
-            stamp: Its number and times.
+            stamp: Number and times of the scan.
             verdict: Result of checking the codes of the scan.
 
         Returns:
@@ -97,14 +97,14 @@ def tracker_options(
     baseline_ohm: Float | None = None,
     period_s: float = 0.08,
 ) -> TrackerOptions:
-    """Return the :class:`Tracker` options for the scans of a patch.
+    """Return the :class:`Tracker` options for a patch's scans.
 
     Args:
         patch: Configuration of the patch.
         config: Settings of the solver.
         relative_noise: Standard deviation of a resistance, relative to the resistance.
-        baseline_ohm: (U, K) resistances at rest, ohm; None if not known yet.
-        period_s: SYNC period of the hand, s.
+        baseline_ohm: (U, K) resistances at rest, in ohms; None if not known yet.
+        period_s: SYNC period (s) of the hand.
     """
     calibration = patch.calibration
     return TrackerOptions(
@@ -130,7 +130,7 @@ def tracker_options(
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Check that the solver supports the layout of a patch, and prepare its kernels and tables.
+    """Check that the solver supports a patch's layout, and prepare its kernels and tables.
 
     The preparation is slow, so it must be done before any node is started.
 

@@ -1,8 +1,8 @@
-"""Read and write the object dictionary of a remote node by SDO.
+"""Read and write a remote node's object dictionary over SDO.
 
 The SDO client of the canopen package blocks the calling thread until the mainline delivers the response
-through :meth:`SkinNetwork.notify`. It sets no limit to the length or the duration of a transfer, so a faulty
-node could exhaust the memory or block a thread forever. This module adds both limits.
+through :meth:`SkinNetwork.notify`. It does not limit the length or duration of a transfer, so a faulty node
+could exhaust the memory or block a thread forever. This module adds both limits.
 
 Threads: only one thread at a time may access a node. Different nodes may be accessed in parallel.
 """
@@ -29,10 +29,11 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Maximum number of attempts at a transfer that gets no response, or the response to an earlier transfer."""
+"""Maximum number of attempts for a transfer that gets no response, or the response to an earlier transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""Error messages of canopen for a missing response. The second follows canopen's own retransmission requests.
+"""canopen's error messages for a missing response. The second occurs after canopen's own retransmission
+requests.
 """
 
 _OUT_OF_STEP: Final = (
@@ -43,19 +44,19 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes that indicate a lost frame. A transfer aborted with one of them is retried."""
+"""SDO abort codes that indicate a lost frame. A transfer aborted with one of these codes is retried."""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
 """Maximum length (bytes) of a value: the baseline of the largest possible patch."""
 
 MAX_TEXT_BYTES: Final = 4096
-"""Maximum length (bytes) of a short value, such as a text."""
+"""Maximum length (bytes) of a short value, such as a string."""
 
 _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""Time limit (s) of a transfer: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of the longest value
+"""Time limit (s) for a transfer: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of the longest value
 allowed.
 """
 
@@ -74,7 +75,7 @@ class _UploadTooLong(Exception):
 
 
 class SkinNetwork(canopen.Network):
-    """Network of the canopen package that sends its frames through ``send``."""
+    """canopen network that sends its frames through ``send``."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
@@ -92,11 +93,11 @@ class SkinNetwork(canopen.Network):
 
 
 class RemoteOd:
-    """Object dictionary of a remote node, read and written by SDO.
+    """Object dictionary of a remote node, read and written over SDO.
 
-    A value has the type ``u8``, ``u16``, ``u32`` or ``f32``. ``abandoned`` is called after each segment. If
-    it returns True, the transfer is aborted and Abandoned is raised. A transfer that gets no response or
-    raises an unexpected exception is retried.
+    A value is of type ``u8``, ``u16``, ``u32`` or ``f32``. ``abandoned`` is called after each segment. If it
+    returns True, the transfer is aborted and Abandoned is raised. A transfer that gets no response or raises
+    an unexpected exception is retried.
 
     Threads: only one thread at a time may use an instance.
 
@@ -165,7 +166,7 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Return a long value by block transfer, or by segmented transfer if the node aborts the former."""
+        """Return a long value by block transfer or, if the node aborts that, by segmented transfer."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
@@ -257,9 +258,9 @@ class RemoteOd:
     def _whole(self, stream: Any, most: int) -> bytes:
         """Read a stream to its end.
 
-        Raises SdoCommunicationError if the data and the announced size differ in length, _UploadTooLong if
-        the data exceed ``most`` bytes or the transfer takes too long, and Abandoned if ``abandoned`` returns
-        True.
+        Raises SdoCommunicationError if the length of the data differs from the announced size, _UploadTooLong
+        if the data exceed ``most`` bytes or the transfer takes too long, and Abandoned if ``abandoned``
+        returns True.
         """
         if stream.size is not None and stream.size > most:
             raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected at most {most}")
@@ -304,7 +305,7 @@ class RemoteOd:
 
 
 def _send(stream: Any, data: bytes) -> None:
-    """Write ``data`` to a stream in segments. Empty data make one empty segment."""
+    """Write ``data`` to a stream in segments. Empty data are sent as one empty segment."""
     at = stream.write(data[:SEGMENT_BYTES])
     while at < len(data):
         at += stream.write(data[at : at + SEGMENT_BYTES])

@@ -3,8 +3,8 @@
 ==================  =========================================================  ==============================
 stream              canopen 2.4.1                                              here
 ==================  =========================================================  ==============================
-block upload        calls its own ``abort``, which it does not have, if the    has one
-                    end of the transfer does not arrive
+block upload        calls a missing method, ``abort``, if the end of the       has the method
+                    transfer does not arrive
 block upload        requests a late segment twice                              requests it once
 block download      raises RuntimeError if a segment of the last block must    sends it again
                     be sent again; its CRC then counts segments twice
@@ -41,13 +41,13 @@ _SETTLE_S: Final = 0.1
 """Time limit (s) for responses to cease after an abort. Another SDO client may keep the node responding."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmissions in one transfer. A node that requests more probably rejects every block,
-so the transfer fails.
+"""Maximum number of retransmissions in one transfer. If a node requests more than this, it probably rejects
+every block, so the transfer fails.
 """
 
 
 class Client(SdoClient):
-    """SDO client of the canopen package for node ``node_id``, without an object dictionary."""
+    """canopen SDO client for node ``node_id``, without an object dictionary."""
 
     def __init__(self, network: canopen.Network, node_id: int) -> None:
         empty: Any = ObjectDictionary  # canopen's constructor has no type annotations

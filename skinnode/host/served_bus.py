@@ -1,4 +1,4 @@
-"""Serve a bus of the hand: its SYNC, LSS, other masters and health."""
+"""Handle SYNC, LSS, other masters and health for a bus of the hand."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skinnode.host.sync import SyncFollower, Ticks
 
 @dataclass(frozen=True, slots=True)
 class ServedBus:
-    """Bus of the hand with its SYNC times, SYNC follower, LSS master and detector of other masters."""
+    """Bus of the hand: its SYNC times, SYNC follower, LSS master, and detector of other masters."""
 
     link: BusLink
     ticks: Ticks
@@ -53,7 +53,7 @@ class ServedBus:
 
         Args:
             t_up_ns: Monotonic time (ns) at which bring-up ended.
-            period_ns: SYNC period, ns.
+            period_ns: SYNC period (ns).
         """
         if self.link.config.role == "master" or self.link.failure is not None:
             return False
@@ -62,7 +62,7 @@ class ServedBus:
 
 
 def serve_bus(hand: HandConfig, link: BusLink) -> ServedBus:
-    """Register the handlers for the frames of other masters and for LSS responses."""
+    """Register the handlers for other masters' frames and for LSS responses."""
     ticks = Ticks(hand.sync.counter_overflow)
     heard, lss = receive_bus(hand, link, ticks), LssMaster(link.send)
     link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)

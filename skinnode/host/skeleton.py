@@ -12,16 +12,12 @@ from skinnode.model.pose import Pose
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """Poses of the patches on their links, and of the links in the coordinate frame of the hand."""
+    """Poses of the patches on their links, and of the links in the hand's coordinate frame."""
 
     mounts: Mapping[str, Mount] = field(default_factory=dict)
-    """Link and pose of each patch, by patch name. Without an entry, the frame of the patch is that of the
-    hand.
-    """
+    """Link and pose of each patch, by patch name. A patch without an entry shares the hand's frame."""
     link_poses: Mapping[str, Pose] = field(default_factory=dict)
-    """Pose of each link in the hand, by link name. Without an entry, the frame of the link is that of the
-    hand.
-    """
+    """Pose of each link in the hand, by link name. A link without an entry shares the hand's frame."""
 
     @classmethod
     def of(cls, hand: HandConfig) -> Skeleton:
@@ -30,9 +26,9 @@ class Skeleton:
         return cls(mounts, {link.name: link.pose.build() for link in hand.links})
 
     def mount(self, patch: str) -> Mount:
-        """Return the link of a patch, and the pose of the patch on it."""
+        """Return a patch's link, and the pose of the patch on that link."""
         return self.mounts.get(patch, Mount())
 
     def link_pose(self, link: str) -> Pose:
-        """Return the pose of a link in the coordinate frame of the hand."""
+        """Return the pose of a link in the hand's coordinate frame."""
         return self.link_poses.get(link, Pose())

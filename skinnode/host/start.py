@@ -160,9 +160,9 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start the nodes whose NMT master is the host, and wait until their heartbeats report operational.
+    """Start the nodes on buses where the host is the master, and wait until they report operational.
 
-    The time limit is counted in polling intervals, so that it excludes any time for which the computer is
+    The time limit is counted in polling intervals, so that it excludes any time during which the computer is
     suspended.
 
     Raises:

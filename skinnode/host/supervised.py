@@ -63,7 +63,7 @@ class Supervised:
     read_ns: int
     """Earliest monotonic time (ns) for the next read of the baseline."""
     job: Future[Joined | None] | None = None
-    """Job in progress with the node. A job that reads only the error register returns None."""
+    """Job in progress for the node. A job that reads only the error register returns None."""
     searching: Future[bool] | None = None
     abandon: threading.Event = field(default_factory=clock.event)
     """Event that aborts the running job."""
@@ -87,8 +87,8 @@ class Supervised:
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None
-    """(U, K) baseline used by the solver, ohm; None before the first bring-up."""
+    """(U, K) baseline used by the solver, in ohms; None before the first bring-up."""
     announced: bool = False
-    """Whether the node has announced a baseline that the solver does not use yet."""
+    """Whether the node has announced a baseline that the solver is not using yet."""
     baselines: int = 0
     complaint: str | None = None

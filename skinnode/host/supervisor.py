@@ -1,12 +1,12 @@
 """Keep the nodes of a running hand operational.
 
-A node that appears late or reappears is configured and started. A changed baseline is read again. The
-supervision of one node does not depend on the others.
+A node that appears late or reappears is configured and started. A changed baseline is reread. The supervision
+of one node does not depend on the others.
 
-Fifty times a second, the supervisor's thread evaluates what the mainline has learned about each node, and
-decides what to do. Anything that waits for a node, such as its configuration, runs as a job on a thread pool.
-A node has at most one job at a time. The supervisor's thread also collects the results of the jobs, so that
-no other thread accesses its state.
+Fifty times a second, the supervisor's thread evaluates the mainline's information about each node and decides
+what to do. Any operation that waits for a node, such as its configuration, runs as a job on a thread pool. A
+node has at most one job at a time. The supervisor's thread also collects the results of the jobs, so that no
+other thread accesses its state.
 
 =========  ========================================  =========================================
 phase      meaning                                   next phase
@@ -59,9 +59,9 @@ class Supervisor(Closing):
 
     Args:
         nodes: All nodes of the hand.
-        running: Nodes that are running already.
-        heartbeat_s: Heartbeat period of the host, s.
-        defects: Collector of the exceptions that concern no single patch.
+        running: Nodes that are already running.
+        heartbeat_s: Heartbeat period (s) of the host.
+        defects: Collector of exceptions that concern no particular patch.
     """
 
     def __init__(
@@ -137,10 +137,10 @@ class Supervisor(Closing):
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
-            assert node_id is not None  # only buses with a node-ID of the host are in the dict
+            assert node_id is not None  # the dict contains only buses on which the host has a node-ID
             try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
-            except BusError:  # the nodes notice a missing heartbeat themselves
+            except BusError:  # the nodes themselves detect a missing heartbeat
                 continue
             except Exception as error:
                 link.defects.report("sending a heartbeat", error)

@@ -1,4 +1,4 @@
-"""Produce SYNC with a counter at a drift-free rate, or follow the SYNC of another producer."""
+"""Produce SYNC with a counter at a drift-free rate, or follow another producer's SYNC."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class SyncStats:
 
     sent: int
     missed: int
-    """Number of SYNC periods skipped because the sending thread ran too late."""
+    """Number of SYNC periods skipped because the sending thread was too late."""
     failed: int
     """Number of SYNC messages that could not be sent on a bus."""
     latest_ns: int
-    """Largest delay (ns) of a SYNC message after its due time."""
+    """Largest delay (ns) of a SYNC message relative to its due time."""
     received: int = 0
     """Number of SYNC messages received on buses that another master runs."""
     irregular: int = 0
@@ -64,7 +64,7 @@ class Ticks:
 
 
 class SyncFollower:
-    """Follower of another producer's SYNC, which it stores in ``ticks``. Mainline only."""
+    """Follower of another producer's SYNC; stores the SYNC times in ``ticks``. Used only by the mainline."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
@@ -73,7 +73,7 @@ class SyncFollower:
         """Monotonic time (ns) of the newest SYNC; 0 before the first one."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """Process a received SYNC. A SYNC without a valid counter is only counted."""
+        """Process a received SYNC. A SYNC without a valid counter is counted but not stored."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -95,18 +95,18 @@ Send = Callable[[int, bytes], None]
 
 
 class SyncProducer(Closing):
-    """Producer of SYNC on one or more buses, simultaneous or staggered, until :meth:`close`.
+    """Producer of simultaneous or staggered SYNC on one or more buses; runs until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
     the first SYNC. If the thread is a whole period late, it skips that period, so that two SYNC messages are
-    never sent in quick succession. A SYNC that has been sent on one bus is sent on the others too.
+    never sent in quick succession. A SYNC that has been sent on one bus is also sent on the others.
 
     Threads: a dedicated thread sends the SYNC messages.
 
     Args:
         buses: For each bus, the function that sends frames, and the SYNC times.
-        period_s: SYNC period, s.
-        stagger_s: Delay (s) of the SYNC from one bus to the next.
+        period_s: SYNC period (s).
+        stagger_s: Delay (s) of SYNC from one bus to the next.
         defects: For each bus, the collector of exceptions.
     """
 
@@ -127,7 +127,7 @@ class SyncProducer(Closing):
         self._thread.start()
 
     def stats(self) -> SyncStats:
-        """Return the counters. Any thread."""
+        """Return the counters. Thread-safe."""
         return SyncStats(self._sent, self._missed, self._failed, self._latest_ns)
 
     def close(self) -> None:
@@ -166,7 +166,7 @@ class SyncProducer(Closing):
             self._wait(due_ns)
             now_ns = clock.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-        # store the time before sending: scans are matched with it as soon as they arrive
+        # store the time before sending: scans are matched to it as soon as they arrive
         payload = bytes([ticks.note(self._number, now_ns)])
         send(SYNC_COB_ID, payload)
 

@@ -1,4 +1,4 @@
-"""Pass to a recorder the frames that a host sends and receives, and the events that affect decoding."""
+"""Pass sent and received frames, and the events that affect their decoding, to a recorder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class HostTap(StreamTap, Protocol):
 
 
 class ContainedTap:
-    """Wrapper that keeps the exceptions of a tap from affecting the host.
+    """Wrapper that keeps a tap's exceptions from affecting the host.
 
     An exception is reported to ``defects``. Only the current entry of the recording is lost.
     """
@@ -33,27 +33,27 @@ class ContainedTap:
         self._tap, self._defects = tap, defects
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Call :meth:`HostTap.received` of the tap."""
+        """Call the tap's :meth:`HostTap.received`."""
         self._do(lambda: self._tap.received(bus, frames))
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """Call :meth:`HostTap.sent` of the tap."""
+        """Call the tap's :meth:`HostTap.sent`."""
         self._do(lambda: self._tap.sent(bus, frame))
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """Call :meth:`StreamTap.resumed` of the tap."""
+        """Call the tap's :meth:`StreamTap.resumed`."""
         self._do(lambda: self._tap.resumed(patch, solver, anew=anew))
 
     def withheld(self, patch: str) -> None:
-        """Call :meth:`StreamTap.withheld` of the tap."""
+        """Call the tap's :meth:`StreamTap.withheld`."""
         self._do(lambda: self._tap.withheld(patch))
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """Call :meth:`StreamTap.polled` of the tap."""
+        """Call the tap's :meth:`StreamTap.polled`."""
         self._do(lambda: self._tap.polled(patch, t_ns))
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Call :meth:`StreamTap.overtaken` of the tap."""
+        """Call the tap's :meth:`StreamTap.overtaken`."""
         self._do(lambda: self._tap.overtaken(patch, scan, t_receive_ns))
 
     def _do(self, entry: Callable[[], None]) -> None:
@@ -66,10 +66,10 @@ class ContainedTap:
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
     """Pass every frame on a bus to ``tap`` from now on.
 
-    Once the mainline runs, only the mainline may call this function.
+    Once the mainline is running, only the mainline may call this function.
 
     Returns:
-        Function that ends the recording. Once the mainline runs, only the mainline may call it.
+        Function that ends the recording. Once the mainline is running, only the mainline may call it.
     """
     received = functools.partial(tap.received, link.config.name)
     sent = functools.partial(tap.sent, link.config.name)

@@ -1,4 +1,4 @@
-"""Tare a patch: the node measures a new baseline, with which the host solves the following scans."""
+"""Tare a patch: the node measures a new baseline, and the host uses it to solve subsequent scans."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _POLL_S: Final = 0.005
 def tare(
     node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
 ) -> None:
-    """Tare a patch. Return as soon as the solver uses the new baseline.
+    """Tare a patch. Return as soon as the solver is using the new baseline.
 
     Args:
-        node: Node of the patch.
+        node: The patch's node.
         baselines: Function that returns the number of new baselines that the host has read so far.
         health: Function that returns the current health of the patch.
         deadline_s: Time limit (s) for the new baseline.
 
     Raises:
-        NodeTimeout: if the solver uses no new baseline in time.
+        NodeTimeout: if the solver does not have a new baseline in time.
         SkinError: for the reasons listed under :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies

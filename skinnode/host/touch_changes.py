@@ -19,13 +19,14 @@ class TouchChange:
 
     patch: str
     t_ns: int
-    """Monotonic time of the scan that showed the change, ns: the SYNC time or, if unknown, the time of the
-    last frame."""
+    """Monotonic time (ns) of the scan that showed the change: the SYNC time or, if unknown, the time of the
+    last frame.
+    """
     scan: int
-    """Number of this scan."""
+    """Number of the scan that showed the change."""
     touched: bool
     seconds: float | None
-    """Duration of the touch that ended, s; None for an onset."""
+    """Duration (s) of the touch that ended; None for an onset."""
 
     @property
     def what(self) -> str:
@@ -41,7 +42,7 @@ class TouchChange:
 
 
 class TouchChanges:
-    """Changes of ``touched`` in the fields of all patches.
+    """Changes in ``touched`` in the fields of all patches.
 
     Threads: only the worker that processes a patch may pass in its fields. Any thread may take the changes.
     """
@@ -51,7 +52,7 @@ class TouchChanges:
         self._waiting: deque[TouchChange] = deque(maxlen=KEPT)
 
     def on_field(self, field: FieldFrame, patch: str) -> None:
-        """Compare a field with the previous field. A field without a touch decision changes nothing."""
+        """Compare a field with the previous field. A field without a touch decision has no effect."""
         stamp, touched = field.stamp, field.touched
         if stamp is None or touched is None or touched == (patch in self._since_ns):
             return

@@ -13,9 +13,9 @@ from skinnode.text.json_values import plain
 
 
 def trust_table(field: FieldFrame | None) -> dict[str, Any]:
-    """Return the trust, precision, data share and faults of a field. Without a field, all values are None.
+    """Return the trust, precision, data share and faults of a field.
 
-    For the data share, see :func:`deepest_data_share`.
+    If there is no field, all values are None. For the data share, see :func:`deepest_data_share`.
     """
     if field is None:
         return dict.fromkeys(("trusted", "distrust", "precise", "deepest_data_share", "data_faults"))
@@ -32,7 +32,7 @@ def trust_table(field: FieldFrame | None) -> dict[str, Any]:
 
 
 def deepest_data_share(field: FieldFrame) -> float:
-    """Return the data share of the depth at the most deeply pressed electrode; 1 without a prior."""
+    """Return the data share of the z displacement at the most deeply pressed electrode; 1 without a prior."""
     if field.data_share is None:
         return 1.0
     return float(field.data_share[..., 2].flat[int(np.argmin(field.displacement_m[..., 2]))])

@@ -1,8 +1,8 @@
 """Run submitted jobs on a pool of worker threads, in order of submission.
 
 Submitting a job takes half a microsecond. Unlike ThreadPoolExecutor, the pool creates no future and takes no
-lock besides that of its queue. An exception in a job is passed to the error handler submitted with the job,
-and the thread goes on to the next job.
+lock other than its queue's lock. An exception in a job is passed to the error handler submitted with the job,
+and the thread continues with the next job.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from skinnode.process.closing import Closing
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Error handler of a job, called on the same thread as the job. It must not raise."""
+"""Error handler for a job, called on the same thread as the job. It must not raise."""
 
 
 class Workers(Closing):
@@ -60,7 +60,7 @@ class Workers(Closing):
 
 
 class Inline:
-    """Replacement for :class:`Workers` that runs each job at once on the submitting thread."""
+    """Replacement for :class:`Workers` that runs each job immediately on the submitting thread."""
 
     def submit(self, job: Job, on_error: OnError) -> None:
         """Run ``job``. Pass its exception, if any, to ``on_error``."""

@@ -20,8 +20,9 @@ _TIME = struct.Struct("<iI")
 _CLASSIC = struct.Struct("<I???B")
 _FD = struct.Struct("<I??B")
 _AFTER_TIME = 12
-"""Offset of ``frame_id`` in a message that begins with a header, bytes. Four encapsulation bytes and eight
-time bytes precede it."""
+"""Offset, in bytes, of ``frame_id`` in a message that begins with a header. It is preceded by four
+encapsulation bytes and eight time bytes.
+"""
 _CLASSIC_BYTES = 8
 
 
@@ -54,8 +55,9 @@ class FrameEncoder:
         self._frame_id = frame_id
         self._templates: dict[tuple[bool, int], bytes] = {}
         self._numbers = -(-(_AFTER_TIME + 4 + len(frame_id.encode()) + 1) // 4) * 4
-        """Offset of the CAN identifier, bytes. ``frame_id``, with its length and final zero, precedes it; the
-        offset is a multiple of 4."""
+        """Offset of the CAN identifier, in bytes. ``frame_id``, with its length and final zero, precedes it;
+        the offset is a multiple of 4.
+        """
 
     def encode(self, frame: Frame) -> bytes:
         """Return the encoded frame; the frame's ``t_ns`` is a time since 1970."""
@@ -80,7 +82,7 @@ def frame_of(data: bytes, name: str) -> Frame:
     """Return the CAN frame from an encoded message; the frame's ``t_ns`` is a time since 1970.
 
     Args:
-        data: Message as CDR.
+        data: CDR-encoded message.
         name: Name of the message.
 
     Raises:

@@ -1,8 +1,8 @@
 """Definitions, in ``ros2msg`` format, of the messages that rosbags does not include.
 
 ``can_msgs/Frame`` is defined by ros_canopen and ``ros2_socketcan_msgs/FdFrame`` by ros2_socketcan. The
-``skinnode_msgs`` messages are our own. Their ``VERSION`` constant increases with every change; a reader
-refuses a newer version.
+``skinnode_msgs`` messages are defined by this project. Their ``VERSION`` constant increases with every
+change; readers refuse newer versions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 from typing import Final
 
 OURS: Final = "skinnode_msgs/"
-"""Name prefix of our own messages."""
+"""Name prefix of this project's own messages."""
 
 CAN_FRAME: Final = "can_msgs/msg/Frame"
 FD_FRAME: Final = "ros2_socketcan_msgs/msg/FdFrame"

@@ -24,7 +24,8 @@ CLOUD_FIELDS: Final = (
 """Fields of a point: displaced position (m) in the patch frame, displacement (m) and its standard deviation
 (m; infinite where unknown), force on the skin (N; NaN if no forces were computed), and the fraction of the
 displacement that the data determine. The points are ordered by upper wire and, within a wire, by
-electrode."""
+electrode.
+"""
 
 _FLOAT32: Final = 7
 """Value of ``PointField.FLOAT32``."""
@@ -35,8 +36,8 @@ def point_cloud(field: FieldFrame, rest_m: Float, t_ns: int) -> Any:
 
     Args:
         field: The field, with a stamp.
-        rest_m: (U, N, 3) electrode positions at rest, m.
-        t_ns: Measurement time since 1970, ns.
+        rest_m: (U, N, 3) electrode positions at rest, in m.
+        t_ns: Measurement time since 1970, in ns.
     """
     assert field.stamp is not None
     shape = field.displacement_m.shape
@@ -61,11 +62,11 @@ def point_cloud(field: FieldFrame, rest_m: Float, t_ns: int) -> Any:
 
 
 def field_info(field: FieldFrame, t_ns: int) -> Any:
-    """Return the data of a field that a point cloud cannot hold, as ``skinnode_msgs/FieldInfo``.
+    """Return the field data that a point cloud cannot contain, as ``skinnode_msgs/FieldInfo``.
 
     Args:
         field: The field, with a stamp.
-        t_ns: Measurement time since 1970, ns.
+        t_ns: Measurement time since 1970, in ns.
     """
     stamp, stats = field.stamp, field.stats
     assert stamp is not None

@@ -22,13 +22,13 @@ class HealthReport:
     """Health of a hand at one instant, and its publisher's counters."""
 
     started_ns: int
-    """Time since 1970 at which the publisher started, ns; identifies the publisher's run."""
+    """Time (ns since 1970) at which the publisher started; identifies the publisher's run."""
     patches: Mapping[str, PatchHealth]
     buses: Mapping[str, BusHealth]
     published: Mapping[str, int]
     """Number of fields sent so far in this run, by patch name."""
     dropped: int
-    """Number of fields of all patches that the publisher could not send in time."""
+    """Number of fields, over all patches, that the publisher could not send in time."""
 
 
 def encode_report(report: HealthReport, t_ns: int) -> bytes:
@@ -36,7 +36,7 @@ def encode_report(report: HealthReport, t_ns: int) -> bytes:
 
     Args:
         report: The report.
-        t_ns: Time since 1970, ns.
+        t_ns: Time since 1970, in ns.
     """
     table = dataclasses.asdict(report)
     del table["started_ns"]

@@ -28,7 +28,7 @@ class PatchTopics(NamedTuple):
 
 
 class BusTopics(NamedTuple):
-    """Topics of a bus, with the names that ros2_socketcan uses."""
+    """Topics of a bus, named as in ros2_socketcan."""
 
     received: str
     sent: str

@@ -32,7 +32,7 @@ def require_mcap(option: str) -> None:
 
 @functools.cache
 def typestore() -> Typestore:
-    """Return the rosbags typestore with the ROS 2 Humble standard messages and our own messages."""
+    """Return the rosbags typestore with the ROS 2 Humble standard messages and this project's messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -49,7 +49,7 @@ def message_type(name: str) -> Any:
 
 
 def encode(message: object, name: str) -> bytes:
-    """Encode a message as CDR, little-endian.
+    """Encode a message as little-endian CDR.
 
     Args:
         message: Instance of ``message_type(name)``.

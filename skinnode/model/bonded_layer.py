@@ -1,7 +1,7 @@
 """Surface displacement of an incompressible elastic layer on a rigid base, under normal loads.
 
-The layer has the thickness h and the shear modulus G and is bonded to the base. A sinusoidal pressure with
-wave number k and amplitude 1 displaces the surface by the following amplitudes, where x = k h:
+The layer has thickness h and shear modulus G, and is bonded to the base. A sinusoidal pressure with wave
+number k and amplitude 1 displaces the surface by the following amplitudes, where x = k h:
 
     normal      (sinh 2x − 2x) / (2 G k (cosh 2x + 1 + 2x²))
     outwards            x²     / (  G k (cosh 2x + 1 + 2x²))
@@ -24,11 +24,13 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.layout import Float
 
 BLUR: Final = 0.1
-"""Standard deviation of the Gaussian that smooths the edge of the load, relative to the radius of the load.
-Without smoothing, the integral over the wave number would converge too slowly."""
+"""Standard deviation of the Gaussian that smooths the edge of the load, relative to the load's radius.
+Without smoothing, the integral over the wave number would converge too slowly.
+"""
 _END: Final = 6.0
 """Upper limit of the integral over the wave number, multiplied by the standard deviation of the Gaussian. At
-this limit, the Gaussian attenuates the Fourier transform of the load by a factor of 1e-8."""
+this limit, the Gaussian attenuates the Fourier transform of the load by a factor of 1e-8.
+"""
 _NODES_PER_WAVE: Final = 8
 """Number of quadrature nodes per period of the Bessel functions at the largest distance."""
 
@@ -40,13 +42,13 @@ def bonded_layer_compliance(
 
     Args:
         rubber: The material; Poisson's ratio is assumed to be 0.5.
-        thickness_m: Thickness h of the layer, metres.
-        distance_m: Distance of each surface point from the centre of the disc, metres; any shape.
-        radius_m: Radius of the disc, metres. The pressure is uniform except at the smoothed edge
+        thickness_m: Thickness h of the layer, in metres.
+        distance_m: Distance of each surface point from the centre of the disc, in metres; any shape.
+        radius_m: Radius of the disc, in metres. The pressure is uniform except at the smoothed edge
             (:data:`BLUR`).
 
     Returns:
-        Normal and tangential displacement per unit force, m/N, each with the shape of ``distance_m``. The
+        Normal and tangential displacement per unit force, in m/N, each with the shape of ``distance_m``. The
         normal displacement has the direction of the force. Under a pressing force, a positive tangential
         displacement points away from the load.
 

@@ -40,14 +40,16 @@ class DataFault:
     """Number of the lower wire; None if the fault affects all lower wires."""
     since: int = 0
     """Number of the scan in which the fault was found. Without a host, scans are counted from the last reset
-    of the tracker."""
+    of the tracker.
+    """
     deviations: float = 0.0
     """Significance of the fault: number of standard deviations that have the same tail probability in a
-    normal distribution; inf if the fault is certain."""
+    normal distribution; inf if the fault is certain.
+    """
 
     @property
     def place(self) -> str:
-        """Faulty part with its wire numbers, such as ``crossing of upper wire 3 and lower wire 12``."""
+        """Faulty part and its wire numbers, such as ``crossing of upper wire 3 and lower wire 12``."""
         match self.part:
             case FaultyPart.CROSSING:
                 return f"crossing of upper wire {self.upper} and lower wire {self.lower}"

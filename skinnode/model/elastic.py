@@ -33,13 +33,13 @@ class Rubber:
     """Linear elastic, isotropic material.
 
     Args:
-        young_pa: Young's modulus, Pa. The default is typical of a soft silicone of about 20 Shore A.
+        young_pa: Young's modulus, in Pa. The default is typical of a soft silicone of about 20 Shore A.
         poisson: Poisson's ratio. The default, 0.5, describes an incompressible material; rubber is nearly
             incompressible. At 0.5, normal and tangential loads do not couple at the surface, and Hertz's
             theory remains exact under friction.
 
     Raises:
-        ValueError: If the modulus is not positive and finite or the ratio is outside 0 … 0.5.
+        ValueError: If the modulus is not positive and finite or the ratio is not between 0 and 0.5.
     """
 
     young_pa: float = 0.7e6
@@ -53,12 +53,12 @@ class Rubber:
 
     @property
     def shear_modulus_pa(self) -> float:
-        """Shear modulus G = E / 2(1 + ν), Pa."""
+        """Shear modulus G = E / 2(1 + ν), in Pa."""
         return self.young_pa / (2 * (1 + self.poisson))
 
     @property
     def contact_modulus_pa(self) -> float:
-        """Contact modulus E* = E / (1 − ν²), Pa, for contact with a rigid body (Johnson eq. 4.17)."""
+        """Contact modulus E* = E / (1 − ν²), in Pa, for contact with a rigid body (Johnson eq. 4.17)."""
         return self.young_pa / (1 - self.poisson**2)
 
 
@@ -67,14 +67,14 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 
     Args:
         rubber: The material.
-        offset_m: (P, 2) offset of each point from the load, metres.
-        softening_m: Softening length ε, metres; r is replaced with √(r² + ε²). This spreads the load over a
+        offset_m: (P, 2) offset of each point from the load, in metres.
+        softening_m: Softening length ε, in metres; r is replaced by √(r² + ε²). This spreads the load over a
             spot with a radius of about ε and keeps the displacement at the load finite. 0 gives an ideal
             point load.
 
     Returns:
-        (P, 3, 3) compliance, m/N. The last axis is the component of the load; the second-to-last axis is the
-        component of the displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
+        (P, 3, 3) compliance, in m/N. The last axis is the component of the load; the second-to-last axis is
+        the component of the displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN, or the softening is negative.
@@ -99,11 +99,11 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
 
     Args:
         rubber: The material.
-        offset_m: (P, 2) offset of each point from the centre of the rectangle, metres.
-        size_m: Lengths of the rectangle in x and y, metres.
+        offset_m: (P, 2) offset of each point from the centre of the rectangle, in metres.
+        size_m: Side lengths of the rectangle in x and y, in metres.
 
     Returns:
-        (P, 3, 3) compliance, m/Pa, with axes as in :func:`point_compliance`.
+        (P, 3, 3) compliance, in m/Pa, with axes as in :func:`point_compliance`.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN, or a length is not positive.
@@ -161,15 +161,15 @@ class HertzContact:
     Inside the contact circle, the pressure is p = p₀ √(1 − r²/a²) and the traction is (t_x p, t_y p, −p). The
     surface displacement has a closed form both inside and outside the circle. Since p is radially symmetric,
     all integrals follow from two functions of r: Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a), and P, the load
-    within the radius r. The shear traction is assumed not to change the pressure. This is exact for
-    ν = 0.5 and an approximation for ν < 0.5 (Johnson 7.1).
+    within radius r. The shear traction is assumed not to change the pressure. This is exact for ν = 0.5 and
+    an approximation for ν < 0.5 (Johnson 7.1).
 
     Args:
         rubber: The material.
-        radius_m: Radius of the sphere, metres.
-        indentation_m: Approach δ of the sphere, metres; 0 means no contact. The normal displacement at the
+        radius_m: Radius of the sphere, in metres.
+        indentation_m: Approach δ of the sphere, in metres; 0 means no contact. The normal displacement at the
             centre of the contact equals δ if there is no shear or if ν = 0.5.
-        center_m: Centre (x, y) of the contact circle, metres.
+        center_m: Centre (x, y) of the contact circle, in metres.
         traction_ratio: Ratio (t_x, t_y) of the shear traction on the rubber to the pressure. It points in the
             sliding direction of the sphere, and its length is the coefficient of friction.
 
@@ -194,22 +194,22 @@ class HertzContact:
 
     @property
     def contact_radius_m(self) -> float:
-        """Contact radius a = √(R δ), metres (Johnson eq. 4.23)."""
+        """Contact radius a = √(R δ), in metres (Johnson eq. 4.23)."""
         return math.sqrt(self.radius_m * self.indentation_m)
 
     @property
     def peak_pressure_pa(self) -> float:
-        """Peak pressure p₀ = 2 E* a / πR, Pa (Johnson eqs. 4.22 and 4.24)."""
+        """Peak pressure p₀ = 2 E* a / πR, in Pa (Johnson eqs. 4.22 and 4.24)."""
         return 2 * self.rubber.contact_modulus_pa * self.contact_radius_m / (math.pi * self.radius_m)
 
     @functools.cached_property
     def force_n(self) -> tuple[float, float, float]:
-        """Total load (x, y, z) on the rubber, N; the normal component is −4/3 E* √R δ^{3/2}."""
+        """Total load (x, y, z) on the rubber, in N; the normal component is −4/3 E* √R δ^{3/2}."""
         normal = 2 / 3 * math.pi * self.peak_pressure_pa * self.contact_radius_m**2
         return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
 
     def traction_pa(self, points_m: ArrayLike) -> Float:
-        """Return the traction (P, 3), Pa, at surface points (P, 2), metres; 0 outside the contact circle.
+        """Return the traction, (P, 3) in Pa, at surface points, (P, 2) in metres; 0 outside the contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.
@@ -223,7 +223,7 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """Return the displacement (P, 3), metres, of surface points (P, 2), metres; 0 if there is no contact.
+        """Return the displacement, (P, 3) in metres, of surface points, (P, 2) in metres; 0 without contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.

@@ -1,9 +1,9 @@
 """Forward model of a patch: wire-to-wire resistances from electrode positions.
 
-The rubber between two electrodes at distance d has the resistance ρ d. The N·M paths between an upper and a
-lower wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F_k is
-the electrostatic potential of M unit charges at the electrodes of lower wire k, summed over the N electrodes
-of the upper wire. Its gradient is ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
+The rubber between two electrodes at distance d has resistance ρ d. The N·M paths between an upper and a lower
+wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F_k is the
+electrostatic potential of M unit charges at the electrodes of lower wire k, summed over the N electrodes of
+the upper wire. Its gradient is ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
 
 These NumPy functions are the reference for the compiled functions in ``kernels``.
 """
@@ -23,7 +23,7 @@ def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Return F (U, K), 1/m, for upper electrodes at ``upper_m`` (U, N, 3), metres.
+    """Return F, (U, K) in 1/m, for upper electrodes at ``upper_m``, (U, N, 3) in metres.
 
     F is inf if an upper electrode coincides with a lower electrode.
 
@@ -40,10 +40,10 @@ def resistance_ohm(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
     Args:
         layout: The patch.
-        upper_m: (U, N, 3) positions of the upper electrodes, metres.
+        upper_m: (U, N, 3) positions of the upper electrodes, in metres.
 
     Returns:
-        (U, K) resistances, ohm.
+        (U, K) resistances, in ohms.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN.
@@ -56,10 +56,10 @@ def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
     Args:
         layout: The patch.
-        upper_m: (U, N, 3) positions of the upper electrodes, metres.
+        upper_m: (U, N, 3) positions of the upper electrodes, in metres.
 
     Returns:
-        (U, K, N, 3) Jacobian, 1/m².
+        (U, K, N, 3) Jacobian, in 1/m².
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN.

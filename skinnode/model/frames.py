@@ -29,10 +29,11 @@ class ScanStamp:
     counter: int
     """Scan number in the CAN frames, u8; equal to the SYNC counter if SYNC frames contain a counter."""
     device_time_us: int
-    """Time of the scan's SYNC on the node's own clock, µs, modulo 2³²; 0 if the summary was lost.
+    """Time of the scan's SYNC on the node's own clock, in µs modulo 2³²; 0 if the summary was lost.
 
     The resolution is 64 µs. The summary contains only the lower 22 bits of the time; the host adds the upper
-    10 bits. Object 0x2011:4 contains the time of the node with a resolution of 1 µs."""
+    10 bits. Object 0x2011:4 contains the node's time with a resolution of 1 µs.
+    """
     t_sync_ns: int
     """Time at which the SYNC of this scan was sent or received; 0 if unknown."""
     t_receive_ns: int
@@ -52,10 +53,11 @@ class ResistanceFrame:
     """One scan of a patch."""
 
     resistance_ohm: Float
-    """(U, K) wire-to-wire resistances, ohm; NaN where invalid."""
+    """(U, K) wire-to-wire resistances, in ohms; NaN where invalid."""
     valid: NDArray[np.bool_]
     """(U, K) mask of the valid resistances; False if a chunk is missing, a wire is open or shorted, or a code
-    is out of range."""
+    is out of range.
+    """
     stamp: ScanStamp
 
 
@@ -70,7 +72,7 @@ class SolveStats:
     steps: int
     """Number of solver iterations; for the posterior method, number of matrix factorisations."""
     time_s: float
-    """Elapsed time, s."""
+    """Elapsed time, in seconds."""
 
 
 _FLAT: Final = np.eye(3)
@@ -79,108 +81,121 @@ _FLAT.setflags(write=False)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """Contact between a body and the skin, with the standard deviation of each value."""
+    """Contact between a body and the skin, including the standard deviation of each value."""
 
     centroid_m: Float
-    """(3,) centre of the normal load on the undeformed skin, in the coordinates of the layout, metres."""
+    """(3,) centre of the normal load on the undeformed skin, in layout coordinates (metres)."""
     centroid_std_m: Float
-    """(3,) standard deviation of the centre, metres."""
+    """(3,) standard deviation of the centre, in metres."""
     area_m2: float
-    """Contact area, m², estimated for a smooth body (Hertz). If the contact is too small to be resolved, this
-    is the area of one electrode cell."""
+    """Contact area, in m², estimated for a smooth body (Hertz). If the contact is too small to be resolved,
+    this is the area of one electrode cell.
+    """
     area_std_m2: float
     normal_force_n: float
-    """Normal force, N; positive if the body presses on the skin."""
+    """Normal force, in N; positive if the body presses on the skin."""
     normal_force_std_n: float
     shear_force_n: Float
-    """(2,) shear force along and across the upper wires, N."""
+    """(2,) shear force along and across the upper wires, in N."""
     shear_force_std_n: Float
-    """(2,) standard deviation of the shear force, N."""
+    """(2,) standard deviation of the shear force, in N."""
     force_calibrated: bool = False
-    """Whether the forces are based on a calibration of this patch (``force_calibrated`` of Tracker or of
+    """Whether the forces are based on a calibration of this patch (``force_calibrated`` in Tracker or in
     ``[patches.calibration]``).
 
     Without a calibration, the standard deviation of the normal force also covers the error of the half-space
     model: for a bonded layer as thick as the clearance, the error is below five standard deviations. The
-    standard deviation of the shear force does not cover the error of the model."""
+    standard deviation of the shear force does not cover the model's error.
+    """
     axes: Float = field(default_factory=lambda: _FLAT)
-    """(3, 3) axes at the centre of the contact, as rows, in the coordinates of the layout. The rows are unit
-    vectors along the upper wires, across them, and out of the skin. On a flat patch, they are the x, y and z
-    axes."""
+    """(3, 3) axes at the centre of the contact, as rows, in layout coordinates. The rows are unit vectors
+    along the upper wires, across them, and out of the skin. On a flat patch, they are the x, y and z axes.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFrame:
-    """Displacement field of a patch, its uncertainty, and the status of each wire."""
+    """Displacement field of a patch, including its uncertainty and the status of each wire."""
 
     displacement_m: Float
-    """(U, N, 3) displacement from the rest position, metres."""
+    """(U, N, 3) displacement from the rest position, in metres."""
     displacement_std_m: Float
-    """(U, N, 3) standard deviation due to noise in the resistances, metres; inf where the displacement is
+    """(U, N, 3) standard deviation due to noise in the resistances, in metres; inf where the displacement is
     unknown. Where the prior contributes to the displacement, the standard deviation is enlarged to cover rare
-    large errors of the prior. An error above five standard deviations therefore indicates a fault."""
+    large errors of the prior. An error above five standard deviations therefore indicates a fault.
+    """
     status: tuple[Status, ...]
     """Status of each upper wire."""
     residual: Float
     """(U,) RMS of the relative residuals of each wire's valid resistances."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) load on the skin at each electrode, N; None if ``contacts`` was switched off. Loads are
+    """(U, N, 3) load on the skin at each electrode, in N; None if ``contacts`` was switched off. Loads are
     computed with the half-space model, or as F = k Δs if the method is ``exact`` and a stiffness k was
-    specified."""
+    specified.
+    """
     stamp: ScanStamp | None = None
     """Number and times of the scan from which the field was computed; None if no host was involved."""
     method: str = "exact"
     """``exact`` if each wire was solved separately; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that were estimated with the prior because their own resistances were
-    insufficient. With the method ``posterior``, these are the wires without any usable resistance. The
-    displacement of such a wire may rest on the prior alone, even if the wire is trusted."""
+    insufficient. With the ``posterior`` method, these are the wires without any usable resistance. The
+    displacement of such a wire may be based on the prior alone, even if the wire is trusted.
+    """
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches the skin, if no wire could be solved, or if
     ``contacts`` was switched off. Detection uses hysteresis from scan to scan, so that noise does not split
-    or remove a contact."""
+    or remove a contact.
+    """
     gain: Float | None = None
     """(U,) estimated relative gain error of each wire's resistances; None if gains are not estimated."""
     noise_factor: float = 1.0
     """Ratio of the estimated noise to the configured noise; exactly 1 as long as the data are consistent with
     the configured noise. If the resistances were computed from codes, the ratio excludes quantization
-    noise."""
+    noise.
+    """
     held: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that were not solved again, because their resistances changed by no more than
-    the noise."""
+    the noise.
+    """
     core_std_m: Float | None = None
-    """(U, N, 3) standard deviation without the enlargement for rare large errors of the prior, metres; None
-    if equal to ``displacement_std_m``."""
+    """(U, N, 3) standard deviation without the enlargement for rare large errors of the prior, in metres;
+    None if equal to ``displacement_std_m``.
+    """
 
     distrust: str | None = None
     """Reason why the field is not trusted; empty if the field is trusted, None if it was not tested."""
     wires_trusted: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that converged and have enough usable readings; None if the readings were not
-    tested."""
+    tested.
+    """
     precise: bool = True
     """Whether the standard deviations are within the limits ``max_std_m`` and ``max_force_std_n``."""
     data_share: Float | None = None
     """(U, N, 3) fraction of each displacement that is determined by the data of this scan rather than by the
-    prior: 1 minus the ratio of the posterior variance to the prior variance. None if all fractions are 1."""
+    prior: 1 minus the ratio of the posterior variance to the prior variance. None if all fractions are 1.
+    """
     touched: bool | None = None
-    """Whether the detector reports a touch; None if the detector is switched off, or if less than half of the
-    readings are usable. A touch lasts without a break until the mean of four scans agrees with rest. Noise
-    alone causes at most ``false_alarms_per_hour`` reports per hour."""
+    """Whether the detector reports a touch; None if the detector is switched off, or if fewer than half of
+    the readings are usable. A touch continues without interruption until the mean of four scans agrees with
+    rest. Noise alone causes at most ``false_alarms_per_hour`` reports per hour.
+    """
     touch_odds: float | None = None
-    """Odds of touch to no touch, given the readings of this scan and the odds after the previous scan; inf if
-    too large for a float, None without detection. The odds are the likelihood ratio of the readings times the
-    prior odds. Without a touch, the readings differ from rest by noise and gain drift. With a touch,
-    independent loads on all cells also displace the skin; all octaves of their depth, from a depth that noise
-    hides to 16 % of the layer height (RMS), are equally likely. The prior is a two-state Markov chain, with
-    one touch per minute that lasts one second on average. The odds do not determine ``touched``, which
-    depends on the accepted number of false alarms instead."""
+    """Odds of touch versus no touch, given the readings of this scan and the odds after the previous scan;
+    inf if too large for a float, None without detection. The odds are the likelihood ratio of the readings
+    times the prior odds. Without a touch, the readings differ from rest by noise and gain drift. With a
+    touch, independent loads on all cells also displace the skin; all octaves of depth, from a depth hidden by
+    noise to 16 % of the layer height (RMS), are equally likely. The prior is a two-state Markov chain, with
+    one touch per minute that lasts one second on average. ``touched`` does not depend on the odds, but on the
+    accepted number of false alarms.
+    """
     faults: tuple[DataFault, ...] = ()
     """Readings that failed a test and were not used to compute the field."""
 
     @property
     def half_width_95_m(self) -> Float:
-        """(U, N, 3) half-width of the 95 % interval around the displacement, metres."""
+        """(U, N, 3) half-width of the 95 % interval around the displacement, in metres."""
         return Z_95_TWO_SIDED * (self.displacement_std_m if self.core_std_m is None else self.core_std_m)
 
     @property
@@ -198,9 +213,9 @@ _Record = TypeVar("_Record", Contact, FieldFrame)
 
 
 def sealed(record: _Record, **changes: Any) -> _Record:
-    """Return a copy of a record with ``changes`` applied and all arrays read-only.
+    """Return a copy of a record with ``changes`` applied and all arrays made read-only.
 
-    The arrays of the copy are views; the original arrays stay writable. Several readers can share the copy.
+    The copy's arrays are views; the original arrays remain writable. Several readers can share the copy.
     """
     twin = _copy(record, changes)
     slots = _SLOTS[type(record)]

@@ -1,8 +1,8 @@
-"""Contacts and wrenches in the coordinate frame of a link or of the hand, with their covariances.
+"""Contacts and wrenches, including covariances, in the coordinate frame of a link or of the hand.
 
-A contact exerts a force f on the skin at a point r. Its wrench is the force f and the torque r × f about the
-origin of the frame. The covariance of the wrench is propagated to first order from the covariances of f and
-r. The errors of f and r are assumed to be independent.
+A contact exerts a force f on the skin at a point r. Its wrench consists of the force f and the torque r × f
+about the origin of the frame. The covariance of the wrench is propagated to first order from the covariances
+of f and r. The errors of f and r are assumed to be independent.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from skinnode.model.layout import Float
 from skinnode.model.pose import Pose
 
 HAND: Final = "hand"
-"""Name of the hand's coordinate frame, and of the link of patches that are mounted on the hand itself."""
+"""Name of the hand's coordinate frame, and link name for patches that are mounted on the hand itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Link and pose at which a patch is mounted on the robot."""
+    """Link on which a patch is mounted, and the patch's pose on that link."""
 
     link: str = HAND
     """Name of the link on which the patch is mounted."""
@@ -43,30 +43,31 @@ class HandContact:
     frame: str
     """Name of the frame in which the contact's vectors are expressed: :data:`HAND` or the link."""
     position_m: Float
-    """(3,) centre of the normal load on the undeformed skin, metres."""
+    """(3,) centre of the normal load on the undeformed skin, in metres."""
     position_covariance_m2: Float
-    """(3, 3) covariance of the position, m²."""
+    """(3, 3) covariance of the position, in m²."""
     normal: Float
     """(3,) unit normal of the skin at the contact, pointing outwards. An object presses in the opposite
-    direction."""
+    direction.
+    """
     normal_force_n: float
-    """Normal force, N; positive if the object presses on the skin."""
+    """Normal force, in N; positive if the object presses on the skin."""
     normal_force_std_n: float
     force_n: Float
-    """(3,) force on the skin, N: vector sum of the normal force and the shear force."""
+    """(3,) force on the skin, in N: vector sum of the normal force and the shear force."""
     force_covariance_n2: Float
-    """(3, 3) covariance of the force, N²."""
+    """(3, 3) covariance of the force, in N²."""
     area_m2: float
-    """Contact area, m², as in :class:`~skinnode.Contact`."""
+    """Contact area, in m², as in :class:`~skinnode.Contact`."""
     area_std_m2: float
     force_calibrated: bool
     """Whether the forces are based on a calibration of the patch."""
     trusted: bool
-    """Whether the field of the patch is trusted."""
+    """Whether the patch's field is trusted."""
 
     @classmethod
     def on_link(cls, contact: Contact, patch: str, mount: Mount, *, trusted: bool) -> HandContact:
-        """Return a contact, expressed in the coordinate frame of the patch's link.
+        """Return a contact expressed in the coordinate frame of the patch's link.
 
         Args:
             contact: The contact, in the frame of the patch.
@@ -98,16 +99,16 @@ class HandContact:
 
     @property
     def position_std_m(self) -> Float:
-        """(3,) standard deviation of the position along each axis, metres."""
+        """(3,) standard deviation of the position along each axis, in metres."""
         return np.asarray(np.sqrt(np.diag(self.position_covariance_m2)))
 
     @property
     def force_std_n(self) -> Float:
-        """(3,) standard deviation of the force along each axis, N."""
+        """(3,) standard deviation of the force along each axis, in N."""
         return np.asarray(np.sqrt(np.diag(self.force_covariance_n2)))
 
     def moved(self, pose: Pose, frame: str = HAND) -> HandContact:
-        """Return the contact, expressed in another coordinate frame.
+        """Return the contact expressed in another coordinate frame.
 
         Args:
             pose: Pose of this contact's frame in the other frame.
@@ -136,9 +137,9 @@ class Wrench:
     frame: str
     """Name of the frame in which all vectors are expressed; the torque is about the origin of this frame."""
     force_n: Float
-    """(3,) force on the skin, N."""
+    """(3,) force on the skin, in N."""
     torque_nm: Float
-    """(3,) torque on the skin about the origin of the frame, N m."""
+    """(3,) torque on the skin about the origin of the frame, in N m."""
     covariance: Float
     """(6, 6) covariance of force and torque, in N², N² m and N² m²."""
     contacts: int
@@ -150,16 +151,16 @@ class Wrench:
 
     @property
     def force_std_n(self) -> Float:
-        """(3,) standard deviation of the force, N."""
+        """(3,) standard deviation of the force, in N."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
 
     @property
     def torque_std_nm(self) -> Float:
-        """(3,) standard deviation of the torque, N m."""
+        """(3,) standard deviation of the torque, in N m."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
 
     def moved(self, pose: Pose, frame: str = HAND) -> Wrench:
-        """Return the wrench, expressed in another coordinate frame, with the torque about its origin.
+        """Return the wrench expressed in another coordinate frame, with the torque about that frame's origin.
 
         Args:
             pose: Pose of this wrench's frame in the other frame.
@@ -211,7 +212,7 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
 
 
 def _covariance(contact: HandContact) -> Float:
-    """Return the covariance (6, 6) of a contact's wrench to first order."""
+    """Return the (6, 6) covariance of a contact's wrench, to first order."""
     by_force = np.vstack([np.eye(3), _cross(contact.position_m)])
     by_position = np.vstack([np.zeros((3, 3)), -_cross(contact.force_n)])
     return np.asarray(

@@ -2,8 +2,8 @@
 
 Lower electrodes are stored as (3, M, K), and the Jacobian is stored transposed as (3N, K). Values of
 neighbouring lower wires are thus contiguous in memory, and the sums over electrodes stay in registers. Most
-of the run time goes into the inverse distances of electrode pairs. They are computed without square roots or
-divisions, which are slow on all processors. Lengths may be in any unit; F has the inverse unit.
+of the run time is spent on the inverse distances between electrodes. They are computed without square roots
+or divisions, which are slow on all processors. Lengths may be in any unit; F has the inverse unit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _T = TypeVar("_T", float, Float)
 
 
 def lower_rows(lower: Float) -> Float:
-    """Transpose lower electrodes (K, M, 3) to the axis order (3, M, K) of the kernels."""
+    """Transpose lower electrodes (K, M, 3) to the kernels' axis order (3, M, K)."""
     return np.ascontiguousarray(lower.transpose(2, 1, 0))
 
 
@@ -30,7 +30,7 @@ def relative_residual(a: _T, f: _T) -> _T:
 
 
 relative_residual_part = njit_body(relative_residual)
-"""``relative_residual`` as a function that kernels can call."""
+"""Version of ``relative_residual`` that kernels can call."""
 
 
 @njit_part

@@ -21,15 +21,17 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes on a patch, such as 32 × 32. At this number, each covariance matrix of
-the posterior method has 3072 rows and takes 75 MB."""
+"""Maximum number of upper electrodes on a patch, for example 32 × 32. At this size, each covariance matrix of
+the posterior method has 3072 rows and takes 75 MB.
+"""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of pairs of an upper and a lower electrode on a patch. At this number, the offset vectors of
-all pairs take 100 MB."""
+"""Maximum number of pairs of an upper and a lower electrode on a patch. At this size, the offset vectors of
+all pairs take 100 MB.
+"""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Rounding unit of the coordinates in the layout hash, metres."""
+"""Rounding unit (metres) for the coordinates in the layout hash."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
@@ -91,10 +93,10 @@ class PatchLayout:
     """Positions of a patch's electrodes at rest, and the resistivity of the rubber.
 
     Args:
-        upper_m: (U, N, 3) electrodes of the upper wires, metres. These electrodes move with the surface.
-        lower_m: (K, M, 3) electrodes of the lower wires, metres. These electrodes are fixed.
-        resistivity_ohm_per_m: Resistance of the rubber between two electrodes, per metre of their distance;
-            called g in Xu et al. 2018.
+        upper_m: (U, N, 3) electrodes of the upper wires, in metres. These electrodes move with the surface.
+        lower_m: (K, M, 3) electrodes of the lower wires, in metres. These electrodes are fixed.
+        resistivity_ohm_per_m: Resistance of the rubber between two electrodes, per metre of distance; called
+            g in Xu et al. 2018.
         name: Name of the layout; it need not be the name of a preset.
 
     Raises:
@@ -147,7 +149,7 @@ class PatchLayout:
         lower_electrodes: int | None = None,
         resistivity_ohm_per_m: float = 1e7,
     ) -> PatchLayout:
-        """Return a flat layout of a given size; the same object for the same arguments.
+        """Return a flat layout of a given size; calls with equal arguments return the same object.
 
         Layouts are immutable, and the tables of a layout (prior, joint distribution of the readings) are
         computed once for each object.
@@ -161,14 +163,14 @@ class PatchLayout:
 
         Args:
             name: ``aligned``, ``symmetric`` or ``staggered``.
-            pitch_m: Distance between neighbouring upper electrodes, metres.
-            height_m: Height of the upper electrodes above the lower layer, metres.
+            pitch_m: Distance between neighbouring upper electrodes, in metres.
+            height_m: Height of the upper electrodes above the lower layer, in metres.
             upper_wires: Number of upper wires, U.
             upper_electrodes: Number of electrodes per upper wire, N.
             lower_wires: Number of lower wires, K. The default, 3 N, gives each upper wire as many resistances
                 as unknown coordinates.
             lower_electrodes: Number of electrodes per lower wire, M; the default is U.
-            resistivity_ohm_per_m: ρ of the resistor ρ d between two electrodes at distance d, ohm/m.
+            resistivity_ohm_per_m: ρ in ohm/m; the resistance between two electrodes at distance d is ρ d.
 
         Raises:
             ValueError: If the name is unknown, or a number is out of range.
@@ -206,7 +208,7 @@ class PatchLayout:
 
     @functools.cached_property
     def pitch_m(self) -> float:
-        """Median distance between neighbouring electrodes of an upper wire, metres.
+        """Median distance between neighbouring electrodes of an upper wire, in metres.
 
         If each upper wire has only one electrode, the median distance from an upper electrode to the nearest
         lower electrode is used instead.
@@ -219,7 +221,7 @@ class PatchLayout:
 
     @functools.cached_property
     def height_m(self) -> float:
-        """Median height of the upper electrodes above the lower layer, metres."""
+        """Median height of the upper electrodes above the lower layer, in metres."""
         return float(np.median(self.upper_m[..., 2]) - np.median(self.lower_m[..., 2]))
 
     @functools.cached_property

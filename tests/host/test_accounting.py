@@ -70,7 +70,7 @@ def test_each_counter_of_a_patch_is_in_its_sum(counter: str) -> None:
 def test_sums_over_all_buses_and_patches() -> None:
     assert found({"foreign": 7}, {}, {}) == []
     assert found({"foreign": 8}, {}, {}) == ["got 13 PDOs, must be at most the 12 frames that were handled"]
-    line = "got 3 PDOs of wrong length or form, must be at most the 2 malformed frames"
+    line = "got 3 PDOs of wrong length or format, must be at most the 2 malformed frames"
     assert found({"malformed": 2}, {}, {}) == [line]
 
 

@@ -99,8 +99,8 @@ def test_movement_that_ends_at_once_is_doubted_unless_the_patch_counts(counts: b
     pressed = patch.read(0.9 * REST)
     for expected in (
         "",
-        "stopped changing in mid-movement, 1 scan ago",
-        "stopped changing in mid-movement, 2 scans ago",
+        "stopped changing mid-movement, 1 scan ago",
+        "stopped changing mid-movement, 2 scans ago",
     ):
         verdict = patch.see(pressed, (patch.number % 3 + 1) << 6 if counts else 0)
         assert verdict.distrust.endswith(expected) if expected and not counts else not verdict.distrust
@@ -141,7 +141,7 @@ def test_quiet_patch_at_rest_that_says_nothing() -> None:
         assert patch.see(stuck).faults == ()
         assert patch.watch.alive is not Alive.NO
     assert patch.watch.alive is Alive.CANNOT_TELL
-    assert patch.watch.words == "cannot tell whether its converter runs: no code has changed for 63 s"
+    assert patch.watch.words == "cannot tell whether its converter is running: no code has changed for 63 s"
     patch.see(patch.read(REST * 1.01))
     assert (patch.watch.alive, patch.watch.words) == (Alive.YES, "")
 

@@ -221,7 +221,7 @@ def test_a_baseline_file_that_is_none(hand: HandConfig, tmp_path: Path, text: st
     file.write_text(text)
     with pytest.raises(ConfigError) as caught, Host.from_config(changed(hand, patch={"baseline": str(file)})):
         pass
-    assert str(caught.value) == f"{file}: {says}, allowed: 4 lines of 12 positive resistances in ohm"
+    assert str(caught.value) == f"{file}: {says}, allowed: 4 lines of 12 positive resistances in ohms"
 
 
 def test_a_baseline_of_a_file_is_written_to_the_node_once(

@@ -378,7 +378,7 @@ def shrink(source: Path, target: Path) -> None:
 
     picture = Image.open(source).convert("RGB")
     while True:
-        # this quantisation method preserves the colour of thin red lines
+        # this quantization method preserves the colour of thin red lines
         few = picture.quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         few.save(target, optimize=True)
         if target.stat().st_size <= MOST_BYTES:

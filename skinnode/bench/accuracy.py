@@ -117,9 +117,7 @@ def _print_must(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     echo("\nrequirements")
     for row in figures["must"]:
         value = "-" if row["value"] is None else f"{row['value']:.3g}"
-        echo(
-            f"  {row['what']:58}{value:>8}  {row['limit']:18}{'reached' if row['reached'] else 'NOT REACHED'}"
-        )
+        echo(f"  {row['what']:58}{value:>8}  {row['limit']:18}{'met' if row['reached'] else 'NOT MET'}")
 
 
 def _text(value: float | None) -> str:

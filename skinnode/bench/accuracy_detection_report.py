@@ -44,8 +44,8 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     echo(f"CPU time per frame in a stream with touches, percentiles: {stream}")
     echo("\nrequirements")
     for row in figures["must"]:
-        reached = "reached" if row["reached"] else "NOT REACHED"
-        echo(f"  {row['what']:62}{row['value']:>8.3g}  {row['limit']:18}{reached}")
+        verdict = "met" if row["reached"] else "NOT MET"
+        echo(f"  {row['what']:62}{row['value']:>8.3g}  {row['limit']:18}{verdict}")
 
 
 def _print_found(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:

@@ -58,7 +58,7 @@ class Score:
     error_rms_m: float
     reported_rms_m: float
     bound_rms_m: float
-    """RMS Cramér-Rao bound due to quantisation alone, as if the converter were noise-free."""
+    """RMS Cramér-Rao bound due to quantization alone, as if the converter were noise-free."""
     error_max_m: float
     relative_error: float
     """Relative error ‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
@@ -80,7 +80,7 @@ class Score:
 
 @dataclass
 class Scorer:
-    """Scores one patch during a run; ``code_std`` is the standard deviation of R/R0 due to quantisation."""
+    """Scores one patch during a run; ``code_std`` is the standard deviation of R/R0 due to quantization."""
 
     layout: PatchLayout
     code_std: float

@@ -161,7 +161,7 @@ def verdict_lines(must: Iterable[dict[str, Any]]) -> Iterator[str]:
     """Yield one line for each target."""
     for row in must:
         bound = "at least" if row["least"] else "at most"
-        verdict = "reached" if row["reached"] else "NOT reached"
+        verdict = "met" if row["reached"] else "NOT MET"
         note = f" ({row['note']})" if row["note"] else ""
         yield f"{row['what']:58}{row['got']:>10.4g}  {bound} {row['asked']:g}: {verdict}{note}"
 

@@ -359,6 +359,6 @@ LINES: Final = (
 
 def text(row: dict[str, Any]) -> Iterator[str]:
     """Yield the report lines of a scene."""
-    yield f"{row['tried']}: {'target reached' if row['reached'] else 'target NOT reached'}"
+    yield f"{row['tried']}: {'target met' if row['reached'] else 'target NOT MET'}"
     yield f"    before  {row['before']}"
     yield f"    now     {row['now']}"

@@ -555,7 +555,7 @@ def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
 def _print_must(must: list[dict[str, Any]]) -> None:
     for row in must:
         got = "-" if row["got"] is None else f"{row['got']:.2f}".removesuffix(".00")
-        verdict = "reached" if row["reached"] else "NOT reached"
+        verdict = "met" if row["reached"] else "NOT MET"
         typer.echo(f"{row['what']:69}{got:>9}  limit {row['asked']:g}: {verdict}")
 
 

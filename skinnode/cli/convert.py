@@ -37,7 +37,7 @@ def convert(
         Path | None,
         typer.Option(
             "--hand",
-            help="Hand file for a log without a journal, such as a candump log of another master.",
+            help="Hand file for a log without a journal, such as a candump log from another master.",
             metavar="HAND.toml",
         ),
     ] = None,

@@ -199,7 +199,7 @@ class PatchConfig(Table):
     answers at the node-ID, the host finds the node by its serial number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
     """Relative standard deviation of the analogue noise in a resistance measurement, excluding
-    quantisation."""
+    quantization."""
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None

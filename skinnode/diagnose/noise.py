@@ -61,7 +61,7 @@ class NoiseAnalysis:
     noise: Float
     """Measured noise relative to R0; NaN if unknown. It is too large if a touch affects both estimates."""
     stated: Float
-    """Expected noise relative to R0: converter noise and quantisation noise."""
+    """Expected noise relative to R0: converter noise and quantization noise."""
     level: Float
     """Median R/R0."""
     touched: Mask

@@ -90,7 +90,7 @@ class CodeScale:
 
     @property
     def relative_std(self) -> float:
-        """Standard deviation of the quantisation error of R/R0: step / √12."""
+        """Standard deviation of the quantization error of R/R0: step / √12."""
         return self.step / math.sqrt(12.0)
 
 

@@ -348,7 +348,7 @@ def test_a_missed_target_ends_with_status_1(monkeypatch, tmp_path) -> None:
     result = CliRunner().invoke(app, ["trust", "--only", "pair"])
     assert result.exit_code == 1
     assert "two faults" in result.output
-    assert "NOT reached" in result.output
+    assert "NOT MET" in result.output
 
 
 def test_a_row_that_does_not_exist_is_refused(monkeypatch) -> None:

@@ -3,8 +3,8 @@
 If two wires were already crossed when the resistances at rest were measured, the error is invisible until the
 skin moves. The displacements under one wire are then attributed to the other. To test a pair of wires, their
 readings are exchanged in a frame. The log evidence of the frame changes by −αᵀδ − ½ δᵀPδ, where z are the
-readings, P is their precision, α = P z, and δ is the change in z. No parameter is fitted to the frame, so an
-increase of a few nats is significant.
+changes in the readings, P is their precision, α = P z, and δ is the change in z. No parameter is fitted to
+the frame, so an increase of a few nats is significant.
 
 In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), no exchange increased
 the log evidence by more than 2.8 nats. If two wires were actually crossed, exchanging them increased the log

@@ -1,4 +1,4 @@
-"""``skinnode hand``: checks or creates a hand file, or prints the JSON Schema of hand files."""
+"""``skinnode hand``: checks or creates a hand file, prints its JSON Schema, or writes ROS 2 packages for it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from skinnode.host.limitations import Limitation
 
 app = App(
-    help="Check or create a hand file, compute its bus load, or print the JSON Schema.", no_args_is_help=True
+    help="Check or create a hand file, compute its bus load, print the JSON Schema, or write ROS 2 packages.",
+    no_args_is_help=True,
 )
 
 
@@ -207,6 +208,56 @@ def schema() -> None:
     from skinnode.config.schema import schema_text
 
     typer.echo(schema_text(), nl=False)
+
+
+@app.command()
+def ros2(
+    hand: Annotated[Path, typer.Argument(help="The hand.", metavar="HAND.toml")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Existing folder, normally src of a workspace.", metavar="FOLDER"),
+    ],
+) -> None:
+    """Write two ROS 2 packages: the buses of a hand for ros2_canopen, and the messages skinnode_msgs.
+
+    The first package contains a bus.yml, the EDS files and a launch file for each bus. An existing package
+    is not overwritten. No bus is opened.
+    """
+    from skinnode.config import load_hand
+    from skinnode.messages import message_package, ros2_canopen
+
+    config = load_hand(hand)
+    packages = {
+        ros2_canopen.package_name(config): ros2_canopen.package_files(config),
+        message_package.PACKAGE: message_package.package_files(),
+    }
+    _write_packages(output, packages)
+    for name, files in packages.items():
+        typer.echo(f"wrote {output / name} ({counted(len(files), 'file')})")
+    masters = [bus.name for bus in config.buses if bus.role == "master"]
+    if masters:
+        typer.echo(
+            f'note: {", ".join(masters)}: the host must be a guest beside ros2_canopen (role = "guest")'
+        )
+
+
+def _write_packages(folder: Path, packages: dict[str, dict[str, str]]) -> None:
+    from skinnode.errors import ConfigError
+    from skinnode.files.output_file import write_text
+
+    if not folder.is_dir():
+        raise ConfigError("--output", str(folder), "an existing folder")
+    for name in packages:
+        if (folder / name).exists():
+            raise ConfigError("--output", str(folder), f"a folder without {name}; remove that folder first")
+    for files in packages.values():
+        for path, text in files.items():
+            file = folder / path
+            try:
+                file.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError("--output", str(file.parent), f"a writable folder ({error.strerror})") from error
+            write_text("--output", file, text)
 
 
 @app.command()

@@ -5,7 +5,8 @@ decodes messages as CDR with rosbags, an optional dependency. Each other module 
 data: ``can_frames`` (raw CAN frames), ``fields`` (displacement fields), ``contacts`` (contacts and their
 wrenches), ``health`` (health and events), and ``poses`` (poses of patches and links). ``full_field`` and
 ``health_report`` convert fields and health losslessly, for :mod:`skinnode.remote`. ``topics`` names topics
-and coordinate frames.
+and coordinate frames. ``message_package`` and ``ros2_canopen`` write ROS 2 packages: the definitions of
+``skinnode_msgs``, and the buses of a hand for ros2_canopen.
 
 ==============================  =================================================================
 data                            message

@@ -51,14 +51,14 @@ class HandTopics:
     @staticmethod
     def base_of(hand: str) -> str:
         """Return the namespace of the hand named ``hand``."""
-        return f"/{_tokens([hand])[hand]}"
+        return f"/{ros_names([hand])[hand]}"
 
     @classmethod
     def of(cls, hand: HandConfig) -> HandTopics:
         """Return the topics of a hand."""
         base = cls.base_of(hand.name)
-        patches = _tokens([patch.name for patch in hand.patches])
-        buses = _tokens([bus.name for bus in hand.buses])
+        patches = ros_names([patch.name for patch in hand.patches])
+        buses = ros_names([bus.name for bus in hand.buses])
         return cls(
             {
                 name: PatchTopics(*(f"{base}/{token}/{part}" for part in PatchTopics._fields))
@@ -89,8 +89,8 @@ def patch_frame(patch: str) -> str:
     return f"skin/{patch}"
 
 
-def _tokens(names: Iterable[str]) -> dict[str, str]:
-    """Return a valid and unique ROS 2 name for each name."""
+def ros_names(names: Iterable[str]) -> dict[str, str]:
+    """Return a valid and unique ROS 2 name for each name of a hand file."""
     tokens: dict[str, str] = {}
     for name in names:
         token = re.sub("[^A-Za-z0-9_]", "_", name) or "_"

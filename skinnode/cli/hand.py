@@ -220,8 +220,8 @@ def ros2(
 ) -> None:
     """Write two ROS 2 packages: the buses of a hand for ros2_canopen, and the messages skinnode_msgs.
 
-    The first package contains a bus.yml, the EDS files and a launch file for each bus. An existing package
-    is not overwritten. No bus is opened.
+    The first package contains a bus.yml, the EDS files and a launch file for each bus. An existing file with
+    other content is not overwritten. No bus is opened.
     """
     from skinnode.config import load_hand
     from skinnode.messages import message_package, ros2_canopen
@@ -231,7 +231,7 @@ def ros2(
         ros2_canopen.package_name(config): ros2_canopen.package_files(config),
         message_package.PACKAGE: message_package.package_files(),
     }
-    _write_packages(output, packages)
+    _write_new({output / path: text for files in packages.values() for path, text in files.items()}, output)
     for name, files in packages.items():
         typer.echo(f"wrote {output / name} ({counted(len(files), 'file')})")
     masters = [bus.name for bus in config.buses if bus.role == "master"]
@@ -241,23 +241,22 @@ def ros2(
         )
 
 
-def _write_packages(folder: Path, packages: dict[str, dict[str, str]]) -> None:
+def _write_new(texts: dict[Path, str], folder: Path) -> None:
+    """Write files below an existing folder, unless one of them exists with other content."""
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import write_text
 
     if not folder.is_dir():
         raise ConfigError("--output", str(folder), "an existing folder")
-    for name in packages:
-        if (folder / name).exists():
-            raise ConfigError("--output", str(folder), f"a folder without {name}; remove that folder first")
-    for files in packages.values():
-        for path, text in files.items():
-            file = folder / path
-            try:
-                file.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError("--output", str(file.parent), f"a writable folder ({error.strerror})") from error
-            write_text("--output", file, text)
+    try:
+        for file, text in texts.items():
+            if file.exists() and file.read_bytes() != text.encode():
+                raise ConfigError("--output", str(file), "no such file, or one with the same content; remove it")
+            file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("--output", str(folder), f"a writable folder ({error.strerror})") from error
+    for file, text in texts.items():
+        write_text("--output", file, text)
 
 
 @app.command()

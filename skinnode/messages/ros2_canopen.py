@@ -11,6 +11,7 @@ of every chunk into a queue without a limit, from which it takes at most ten val
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from typing import Final
@@ -18,7 +19,7 @@ from typing import Final
 from skinnode.bus_load.plan import inhibit_time_100us
 from skinnode.canopen import indices as od
 from skinnode.config import BusConfig, HandConfig, PatchConfig
-from skinnode.errors import ConfigError
+from skinnode.errors import ConfigError, Shown
 from skinnode.messages.topics import ros_names
 from skinnode.protocol.eds_files import eds_name, eds_text
 from skinnode.protocol.profile import PatchProfile
@@ -60,7 +61,7 @@ def package_files(hand: HandConfig) -> dict[str, str]:
         files[f"launch/{folder}.launch.py"] = _LAUNCH.format(
             package=package,
             folder=folder,
-            channel=bus.channel if bus.interface == "socketcan" else folder,
+            channel=json.dumps(bus.channel if bus.interface == "socketcan" else folder),
             namespace=f"/{folder}" if len(buses) > 1 else "",
         )
     return {f"{package}/{path}": text for path, text in files.items()}
@@ -85,7 +86,7 @@ def bus_yml(hand: HandConfig, bus: BusConfig) -> str:
     if bus.fd:
         key = f"buses[{hand.buses.index(bus)}].fd"
         allowed = "false for ros2_canopen, whose PDOs have at most 8 bytes"
-        raise ConfigError(key, True, allowed, where=hand.where(key))
+        raise ConfigError(key, Shown("true"), allowed, where=hand.where(key))
     names = ros_names(patch.name for patch in hand.patches)
     text = _MASTER.format(
         hand=hand.name,
@@ -158,10 +159,18 @@ def _values(
 
 
 def _entry(index: int, subindex: int, value: int, meaning: str) -> str:
-    shown = f"0x{value:X}" if index in (od.COB_ID_SYNC,) or subindex == od.PDO_COB_ID else str(value)
+    identifier = (index, subindex) in _IDENTIFIERS
+    shown = f"0x{value:X}" if identifier else str(value)
     entry = f"    - {{index: 0x{index:04X}, sub_index: {subindex}, value: {shown}}}"
     return f"{entry:60s} # {meaning}"
 
+
+_IDENTIFIERS: Final = (
+    (od.COB_ID_SYNC, 0),
+    (od.TPDO1_PARAMETER, od.PDO_COB_ID),
+    (od.TPDO2_PARAMETER, od.PDO_COB_ID),
+)
+"""Objects that contain a CAN identifier, which is written as a hexadecimal number."""
 
 _MASTER: Final = """\
 # bus.yml of ros2_canopen for bus {bus} of hand {hand}, written by skinnode hand ros2.
@@ -231,7 +240,7 @@ def generate_launch_description():
             "master_config": os.path.join(config, "master.dcf"),
             "master_bin": os.path.join(config, "master.bin"),
             "bus_config": os.path.join(config, "bus.yml"),
-            "can_interface_name": "{channel}",
+            "can_interface_name": {channel},
             "namespace": "{namespace}",
         }}.items(),
     )

@@ -119,6 +119,7 @@ BUS = ["--interface", "virtual", "--channel", uuid.uuid4().hex]
 NODE = ["node", "--source", "simulated", "--node-id", "4", *BUS, "--seconds", "0"]
 OPTIONS: dict[str, Callable[[str], list[str]]] = {
     "hand check": lambda file: ["hand", "check", file],
+    "hand ros2": lambda file: ["hand", "ros2", file, "-o", "."],
     "host": lambda file: ["host", file],
     "vcan-sim": lambda file: ["vcan-sim", file],
     "scan --hand": lambda file: ["scan", "--hand", file],

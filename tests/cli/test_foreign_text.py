@@ -124,6 +124,11 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
     "demo": lambda place: [["--json", place.missing + "/x"]],
     "host": lambda place: [[place.missing], [place.broken_hand()], [place.hand(), "--seconds", "0.3"]],
     "hand check": lambda place: [[place.missing], [place.broken_hand()], [place.hand()]],
+    "hand ros2": lambda place: [
+        [place.missing, "-o", str(place.folder)],
+        [place.hand(), "-o", place.missing],
+        [place.hand(), "-o", str(place.folder)],
+    ],
     "hand schema": lambda place: [[WORSE]],
     "hand new": lambda place: [["--patches", WORSE]],
     "node": lambda place: [

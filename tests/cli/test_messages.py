@@ -111,6 +111,8 @@ NOBODY_THERE = [
     "hand check text",
     "hand check nowhere.toml",
     "hand new --buses 9 --patches 2",
+    "hand ros2 two.toml -o nowhere",
+    "hand ros2 wrong.toml -o .",
     "host one.toml --seconds 0",
     "host spelt.toml --seconds 0",
     "host two.toml --channel x",

@@ -24,7 +24,7 @@ def text_of(page: Path) -> str:
 
 
 _COMMAND = re.compile(
-    r"(?:`|^|\.venv/bin/)skinnode ((?:(?:bench|hand|lss) )?[a-z]+)([^`\n]*)", flags=re.MULTILINE
+    r"(?:`|^|\.venv/bin/)skinnode ((?:(?:bench|hand|lss) )?[a-z]+2?)([^`\n]*)", flags=re.MULTILINE
 )
 
 

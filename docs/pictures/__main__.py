@@ -14,8 +14,10 @@ import sys
 import flows
 import patch
 import scans
+import screens
+import streams
 
-PICTURES = {**patch.PICTURES, **flows.PICTURES, **scans.PICTURES}
+PICTURES = {**patch.PICTURES, **flows.PICTURES, **scans.PICTURES, **screens.PICTURES, **streams.PICTURES}
 
 
 def main() -> None:

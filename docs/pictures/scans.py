@@ -7,73 +7,69 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from style import FAULT, FOLDER, GREY, HOST, INK, PAPER, SKIN, save, shrink
+from style import FAULT, FOLDER, HOST, INK, PAPER, SKIN, save, shrink
 
 import skinnode as sk
+from skinnode.bus_load.plan import inhibit_time_100us
 from skinnode.config import load_hand
-from skinnode.host.sync import SyncProducer, Ticks
 from skinnode.protocol.codec import check_of_codes, pack_checked_summary, pack_scan
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
-from skinnode.transport import CanPort
-from vcan_sim.fleet import Fleet
-from vcan_sim.timed_bus import BitRates
-from vcan_sim.timed_interface import segment
-from vcan_sim.trace import Trace
-from vcan_sim.virtual_time import VirtualClock
+from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, StationOptions, TimedBus
 
 ROOT = FOLDER.parents[1]
 
 
 def timing() -> None:
-    """One SYNC period of the hand in examples/hand.toml, on a simulated bus with exact frame times."""
+    """One SYNC period of the hand in examples/hand.toml, with boards that keep the planned times exactly."""
     hand = load_hand(ROOT / "examples" / "hand.toml")
-    buses = tuple(bus.model_copy(update={"interface": "timed", "channel": "can0"}) for bus in hand.buses)
-    hand = hand.model_copy(update={"buses": buses})
-    with VirtualClock() as clock:
-        trace = Trace(segment("can0", clock, BitRates(1_000_000)))
-        with Fleet(hand), CanPort(hand.buses[0]) as port:
-            for patch in hand.patches:
-                port.send(0x600 + patch.node_id, bytes.fromhex("2f 19 10 00 f0 00 00 00"))
-                port.send(0x600 + patch.node_id, bytes.fromhex("2b 00 18 03 06 00 00 00"))
-            clock.sleep(0.2)
-            port.send(0x000, b"\x01\x00")
-            with SyncProducer([(port.send, Ticks(240))], hand.sync.period_s):
-                clock.sleep(1.0)
-        lines = re.findall(r"\((\d+\.\d+)\) \S+ ([0-9A-F]+)#", trace.text())
-    times, ids = np.array([float(t) for t, _ in lines]), np.array([int(i, 16) for _, i in lines])
-    start = times[ids == 0x080][4]
-    shown = (times > start - 1e-3) & (times < start + 81.5e-3)
-    times, ids = 1e3 * (times[shown] - start), ids[shown]
-    figure = Figure(figsize=(9.5, 3.6))
-    axes = figure.add_axes((0.105, 0.13, 0.875, 0.78))
-    rows = [("SYNC", [0x080], HOST)]
-    for patch in hand.patches:
-        rows.append((f"{patch.name}, node {patch.node_id}", [0x180 + patch.node_id, 0x280 + patch.node_id], SKIN))
-    for row, (name, (first, *summary), colour) in enumerate(rows):
-        axes.vlines(times[ids == first], row - 0.33, row + 0.33, color=colour, lw=0.9)
-        for cob_id in summary:
-            axes.vlines(times[ids == cob_id], row - 0.42, row + 0.42, color=FAULT, lw=2.2)
-        axes.text(-1.6, row, name, ha="right", va="center", fontsize=8.5, color=INK)
-    last = max(times[ids == 0x280 + patch.node_id].max() for patch in hand.patches)
-    axes.annotate(
-        "SYNC starts the scan", (0, -0.2), (6, -0.45), fontsize=8.5, color=INK, va="center",
-        arrowprops={"arrowstyle": "-|>", "color": GREY},
-    )  # fmt: skip
-    axes.annotate(
-        "summary (red) ends the scan", (last, 4.45), (last - 24, 4.75), fontsize=8.5, color=INK, va="center",
-        arrowprops={"arrowstyle": "-|>", "color": GREY},
-    )  # fmt: skip
-    gap = np.median(np.diff(times[ids == 0x180 + hand.patches[0].node_id][:100]))
-    axes.text(22, -0.45, f"100 chunks per patch, one every {gap:.2f} ms (inhibit time 0.6 ms)", fontsize=8.5, va="center")
-    axes.set_ylim(5.0, -0.9)
-    axes.set_xlim(-1.2, 81.5)
-    axes.set_yticks([])
-    axes.set_xlabel("ms after SYNC", fontsize=8.5)
-    axes.tick_params(labelsize=8)
-    for side in ("left", "right", "top"):
-        axes.spines[side].set_visible(False)
+    profile = PatchProfile(10, 30, 10, 10)
+    step_ns = 100_000 * inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1)
+    codes = np.random.default_rng(1).integers(40_000, 49_000, (10, 30))
+    chunks = pack_scan(codes, 1, profile)
+    summary = pack_checked_summary(1, 0, len(chunks), 0, check_of_codes(codes, profile))
+    queued = [(0, 0, CanFrame(0x080, b"\x01")), (hand.sync.period_ms * 1_000_000, 0, CanFrame(0x080, b"\x02"))]
+    for station, patch in enumerate(hand.patches, start=1):
+        for number, data in enumerate([*chunks, summary]):
+            base = 0x180 if number < len(chunks) else 0x280
+            queued.append((300_000 + number * step_ns, station, CanFrame(base + patch.node_id, data)))
+    bus = TimedBus([StationOptions()] * (len(hand.patches) + 1), BitRates(1_000_000))
+    for time_ns, station, frame in sorted(queued, key=lambda each: each[:2]):
+        bus.send(time_ns, station, frame)
+    sent = [event for event in bus.advance(10**9) if isinstance(event, Delivered)]
+    figure = Figure(figsize=(9.5, 4.3))
+    whole, part = figure.add_axes((0.11, 0.56, 0.87, 0.38)), figure.add_axes((0.11, 0.12, 0.87, 0.32))
+    rows = [("SYNC", (0x080,), HOST)] + [
+        (f"{patch.name}, node {patch.node_id}", (0x180 + patch.node_id, 0x280 + patch.node_id), SKIN)
+        for patch in hand.patches
+    ]
+    last = 1e-6 * max(event.time_ns for event in sent if event.frame.can_id >= 0x280)
+    for axes, first_ms, last_ms in ((whole, -0.6, 81.5), (part, -0.05, 3.0)):
+        for row, (name, ids, colour) in enumerate(rows):
+            for event in sent:
+                if event.frame.can_id in ids:
+                    start, end = 1e-6 * event.started_ns, 1e-6 * event.time_ns
+                    is_summary, is_chunk = event.frame.can_id >= 0x280, 0x180 < event.frame.can_id < 0x280
+                    width = max(end - start, 0.3 if axes is whole and not is_chunk else 0.0)
+                    axes.barh(row, width, 0.7, start, color=FAULT if is_summary else colour, lw=0)
+            axes.text(-0.008, row, name, ha="right", va="center", fontsize=8.5, transform=_by_row(axes))
+        axes.set_xlim(first_ms, last_ms)
+        axes.set_ylim(len(rows) - 0.4, -0.7)
+        axes.set_yticks([])
+        axes.tick_params(labelsize=8)
+        for side in ("left", "right", "top"):
+            axes.spines[side].set_visible(False)
+    whole.set_title(
+        f"one scan of four patches: SYNC, 100 chunks each, summaries (red) after {last:.0f} ms", fontsize=9, loc="left"
+    )
+    part.set_title("the first 3 ms: the frame with the lowest identifier is sent first", fontsize=9, loc="left")
+    part.set_xlabel("ms after SYNC", fontsize=8.5)
     save(figure, "timing")
+
+
+def _by_row(axes: Any) -> Any:
+    """Coordinates with x as a fraction of the axes and y in rows."""
+    return axes.get_yaxis_transform()
 
 
 def mirror() -> None:
@@ -85,8 +81,6 @@ def mirror() -> None:
     ratio = sk.resistance_ohm(layout, pressed) / sk.resistance_ohm(layout, layout.upper_m)
     scale, profile = CodeScale(16), PatchProfile(10, 30, 10, 10)
     codes = np.round((ratio - scale.lo) / (scale.hi - scale.lo) * (2**16 - 4)).astype(int)
-    chunks = pack_scan(codes, 1, profile)
-    pack_checked_summary(1, 0, len(chunks), 0, check_of_codes(codes, profile))
     known = codes.astype(float)
     known[6, 12:15] = np.nan  # chunk 64: lost
     last = np.full(codes.shape, np.nan)

@@ -27,6 +27,10 @@ from skinnode.protocol.profile import PatchProfile
 BOOT_TIMEOUT_MS: Final = 3000
 """Time limit (ms) for the boot of a patch, as for the host."""
 
+SDO_TIMEOUT_MS: Final = 200
+"""Time limit (ms) for an SDO response. The default of ros2_canopen, 20 ms, is too short for a Linux board under
+load."""
+
 _RESERVED: Final = ("master", "options")
 """Words that ros2_canopen looks for in the names of devices (``device_container.cpp``)."""
 
@@ -124,6 +128,7 @@ def _device(hand: HandConfig, bus: BusConfig, patch: PatchConfig, name: str) -> 
         '  package: "canopen_proxy_driver"',
         "  polling: true",
         "  period: 10                   # ms",
+        f"  sdo_timeout_ms: {SDO_TIMEOUT_MS}",
         f"  boot_timeout_ms: {BOOT_TIMEOUT_MS}",
         f"  heartbeat_producer: {hand.bring_up.heartbeat_ms}      # ms",
         "  tpdo:",

@@ -29,7 +29,7 @@ from .test_supervisor import take
 KEYS_OF_MASTER = {"node_id", "driver", "package", "baudrate", "sync_period", "sync_overflow"}
 KEYS_OF_DEVICE = {
     *("node_id", "serial_number", "dcf", "driver", "package", "heartbeat_producer", "tpdo", "sdo"),
-    *("polling", "period", "boot_timeout_ms"),  # read by canopen_base_driver; the others by dcfgen
+    *("polling", "period", "sdo_timeout_ms", "boot_timeout_ms"),  # read by canopen_base_driver, not by dcfgen
 }
 """Keys of the user guide of ros2_canopen 0.3.4 (configuration.rst), and of its tests (config/simple/bus.yml)."""
 

@@ -3,8 +3,8 @@
     python docs/pictures              draws all of them into docs/img/
     python docs/pictures patch ros2   draws these two
 
-Numbers in the pictures are results of the simulated hand, its host and its solver; nothing is measured on a real
-patch. The screens need Chromium (apt-get install chromium).
+Numbers in the pictures are results of the simulated hand, its host and its solver; nothing is measured on a
+real patch. The screens need Chromium (apt-get install chromium).
 """
 
 from __future__ import annotations

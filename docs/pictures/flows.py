@@ -45,7 +45,16 @@ def resolve() -> None:
     for number, name in enumerate(("press.log", "slide.mcap")):
         box(axes, 15, 50 + 90 * number, 130, 60, name, "frames, journal", HOST)
         arrow(axes, [(145, 80 + 90 * number), (215, 80 + 90 * number)])
-    box(axes, 215, 35, 150, 190, "units", "one recording, one patch,\none combination\nof options;\nfinished units are kept", BUS)
+    box(
+        axes,
+        215,
+        35,
+        150,
+        190,
+        "units",
+        "one recording, one patch,\none combination\nof options;\nfinished units are kept",
+        BUS,
+    )
     for number, (name, sub) in enumerate(
         (("process 1", "core 1"), ("process 2", "core 2"), ("Dask worker", "other computer"))
     ):
@@ -55,7 +64,12 @@ def resolve() -> None:
         arrow(axes, [(620, y + 28), (700, y + 28)])
     files = "press-method=exact.parquet\npress-method=posterior.parquet\n…\ntable of the sweep"
     box(axes, 700, 35, 190, 190, "results", files, HOST)
-    note(axes, 215, 255, "A worker that ends early changes nothing: its unit is solved again, with the same bits as in one process.")
+    note(
+        axes,
+        215,
+        255,
+        "If a worker ends early, its unit is solved again, with the same bits as in one process.",
+    )
     save(figure, "resolve")
 
 
@@ -91,10 +105,28 @@ def ros2() -> None:
         arrow(axes, [(x + 52, 275), (x + 52, 257)], both=True)
     box(axes, 300, 275, 105, 45, "drives", "nodes 1, 2", "#78909c")
     arrow(axes, [(352, 275), (352, 257)], both=True)
-    box(axes, 30, 110, 190, 90, "ros2_canopen", "master: NMT, SYNC,\nconfiguration from bus.yml;\none proxy per patch", PROGRAM)
+    box(
+        axes,
+        30,
+        110,
+        190,
+        90,
+        "ros2_canopen",
+        "master: NMT, SYNC,\nconfiguration from bus.yml;\none proxy per patch",
+        PROGRAM,
+    )
     arrow(axes, [(125, 200), (125, 253)], both=True)
     note(axes, 132, 228, "NMT, SYNC, SDO;\nsummaries", va="center")
-    box(axes, 330, 110, 190, 90, "skinnode host", 'role = "guest":\nreceives all chunks,\nsolves the scans', HOST)
+    box(
+        axes,
+        330,
+        110,
+        190,
+        90,
+        "skinnode host",
+        'role = "guest":\nreceives all chunks,\nsolves the scans',
+        HOST,
+    )
     arrow(axes, [(425, 253), (425, 200)], both=True)
     note(axes, 432, 228, "all chunks", va="center")
     box(axes, 600, 110, 120, 90, "router", "rmw_zenohd", BUS)

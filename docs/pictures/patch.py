@@ -40,18 +40,41 @@ def patch() -> None:
     surface.set_edgecolor("none")
     for u in range(upper.shape[0]):
         along = np.linspace(-1, 17, 60)
-        axes.plot(along, 0 * along + upper[u, 0, 1], depth(along, upper[u, 0, 1]), color=UPPER, lw=1.6, zorder=3)
+        axes.plot(
+            along, 0 * along + upper[u, 0, 1], depth(along, upper[u, 0, 1]), color=UPPER, lw=1.6, zorder=3
+        )
         x, y = upper[u, :, 0], upper[u, :, 1]
         axes.plot(x, y, depth(x, y), "o", color=UPPER, ms=4.5, zorder=4)
     u, k = 1, 9
     axes.plot(lower[k, :, 0], lower[k, :, 1], 0, "-o", color=INK, lw=2.4, ms=4, zorder=5)
-    axes.plot(np.linspace(-1, 17, 60), 0 * along + upper[u, 0, 1], depth(along, upper[u, 0, 1]), color=INK, lw=2.4, zorder=5)
+    axes.plot(
+        np.linspace(-1, 17, 60),
+        0 * along + upper[u, 0, 1],
+        depth(along, upper[u, 0, 1]),
+        color=INK,
+        lw=2.4,
+        zorder=5,
+    )
     for direction, name in (((6, 0, 0), "x"), ((0, 6, 0), "y"), ((0, 0, 6), "z")):
         axes.quiver(0, 0, 0, *direction, color="black", lw=1.8, arrow_length_ratio=0.2, zorder=9)
         axes.text(*(1.12 * np.array(direction)), name, fontsize=12, zorder=10, fontweight="bold")
-    axes.text(17.6, upper[4, 0, 1], height + 0.4, "upper wires, each with\nelectrodes at z = height", color=UPPER, fontsize=10)
+    axes.text(
+        17.6,
+        upper[4, 0, 1],
+        height + 0.4,
+        "upper wires, each with\nelectrodes at z = height",
+        color=UPPER,
+        fontsize=10,
+    )
     axes.text(18.6, -1.5, -1.2, "lower wires, each with\nelectrodes at z = 0", color=LOWER, fontsize=10)
-    axes.text2D(0.16, 0.68, "crossing of upper wire 1 and\nlower wire 9: one resistance", transform=figure.transFigure, fontsize=10, ha="center")
+    axes.text2D(
+        0.16,
+        0.68,
+        "crossing of upper wire 1 and\nlower wire 9: one resistance",
+        transform=figure.transFigure,
+        fontsize=10,
+        ha="center",
+    )
     axes.plot([-2, -2], [18, 18], [0, height], color=GREY, lw=1.5)
     axes.text(-2.4, 18.6, height / 2 - 0.3, "height", color=INK, fontsize=10, ha="right")
     axes.text(9, 8, height - 2.0, "press:\nelectrodes move", fontsize=9, ha="center", zorder=11)
@@ -90,7 +113,9 @@ def frames() -> None:
         axes.plot_trisurf(*placed[:4].T, triangles=[[0, 1, 2], [0, 2, 3]], color=SKIN, alpha=0.25)
         origin = 1e3 * link.points_m(mount.pose.points_m(np.zeros(3)))
         triad(axes, link, mount.pose, 17, "", origin)
-        axes.text(*placed[:4].mean(axis=0), f"patch {each.name}", color=INK, fontsize=10, ha="center", va="center")
+        axes.text(
+            *placed[:4].mean(axis=0), f"patch {each.name}", color=INK, fontsize=10, ha="center", va="center"
+        )
     triad(axes, Pose(), Pose(), 32, "hand", np.zeros(3))
     link = skeleton.link_pose("distal")
     origin = 1e3 * link.points_m(np.zeros(3))
@@ -166,7 +191,16 @@ def board() -> None:
     box(axes, x0 - 14, 270, columns * step_x + 2, 42, "column switch", "", BUS)
     box(axes, 470, 262, 110, 58, "A/D converter", "10 kΩ to ground", BUS)
     arrow(axes, [(x0 + columns * step_x - 12, 291), (470, 291)])
-    box(axes, 640, 80, 120, 150, "board", "my_board:Board\nread() → ohms\n\nskinnode node\n0x1018 serial 77", SKIN)
+    box(
+        axes,
+        640,
+        80,
+        120,
+        150,
+        "board",
+        "my_board:Board\nread() → ohms\n\nskinnode node\n0x1018 serial 77",
+        SKIN,
+    )
     arrow(axes, [(580, 291), (700, 291), (700, 230)], "SPI", (640, 279))
     arrow(axes, [(700, 80), (700, 14), (52, 14), (52, 45)], "selects row and column", (620, 28))
     box(axes, 800, 110, 88, 56, "CAN", "transceiver", BUS)

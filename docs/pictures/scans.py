@@ -28,7 +28,10 @@ def timing() -> None:
     codes = np.random.default_rng(1).integers(40_000, 49_000, (10, 30))
     chunks = pack_scan(codes, 1, profile)
     summary = pack_checked_summary(1, 0, len(chunks), 0, check_of_codes(codes, profile))
-    queued = [(0, 0, CanFrame(0x080, b"\x01")), (hand.sync.period_ms * 1_000_000, 0, CanFrame(0x080, b"\x02"))]
+    queued = [
+        (0, 0, CanFrame(0x080, b"\x01")),
+        (hand.sync.period_ms * 1_000_000, 0, CanFrame(0x080, b"\x02")),
+    ]
     for station, patch in enumerate(hand.patches, start=1):
         for number, data in enumerate([*chunks, summary]):
             base = 0x180 if number < len(chunks) else 0x280
@@ -60,9 +63,13 @@ def timing() -> None:
         for side in ("left", "right", "top"):
             axes.spines[side].set_visible(False)
     whole.set_title(
-        f"one scan of four patches: SYNC, 100 chunks each, summaries (red) after {last:.0f} ms", fontsize=9, loc="left"
+        f"one scan of four patches: SYNC, 100 chunks each, summaries (red) after {last:.0f} ms",
+        fontsize=9,
+        loc="left",
     )
-    part.set_title("the first 3 ms: the frame with the lowest identifier is sent first", fontsize=9, loc="left")
+    part.set_title(
+        "the first 3 ms: the frame with the lowest identifier is sent first", fontsize=9, loc="left"
+    )
     part.set_xlabel("ms after SYNC", fontsize=8.5)
     save(figure, "timing")
 
@@ -79,7 +86,7 @@ def mirror() -> None:
     pressed = layout.upper_m.copy()
     pressed[..., 2] -= 4e-4 * np.exp(-(points**2).sum(axis=-1) / (2 * (7e-3) ** 2))
     ratio = sk.resistance_ohm(layout, pressed) / sk.resistance_ohm(layout, layout.upper_m)
-    scale, profile = CodeScale(16), PatchProfile(10, 30, 10, 10)
+    scale = CodeScale(16)
     codes = np.round((ratio - scale.lo) / (scale.hi - scale.lo) * (2**16 - 4)).astype(int)
     known = codes.astype(float)
     known[6, 12:15] = np.nan  # chunk 64: lost
@@ -87,7 +94,10 @@ def mirror() -> None:
     last.flat[-3:] = codes.flat[-3:]
     figure = Figure(figsize=(9.5, 3.1))
     for number, (values, title) in enumerate(
-        ((last, "mirror of a PLC or proxy: the last chunk"), (known, "assembler: the scan; one chunk was lost"))
+        (
+            (last, "mirror of a PLC or proxy: the last chunk"),
+            (known, "assembler: the scan; one chunk was lost"),
+        )
     ):
         axes = figure.add_axes((0.045 + 0.445 * number, 0.13, 0.415, 0.72))
         axes.set_facecolor("#dfe3e7")
@@ -116,7 +126,12 @@ def scene() -> None:
     (text,) = re.findall(r'```toml title="scene\.toml"\n(.*?)```', page, flags=re.DOTALL)
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "scene.toml").write_text(text, encoding="utf-8")
-        command = [sys.executable, "-c", "from vcan_sim.cli import main; main()", str(ROOT / "examples" / "hand.toml")]
+        command = [
+            sys.executable,
+            "-c",
+            "from vcan_sim.cli import main; main()",
+            str(ROOT / "examples" / "hand.toml"),
+        ]
         subprocess.run(
             [*command, "--scene", f"{folder}/scene.toml", "--plot", str(FOLDER / "scene.png")], check=True
         )

@@ -22,8 +22,8 @@ from vcan_sim.virtual_time import VirtualClock
 
 NOISE: Final = 1e-4
 RATE_HZ: Final = 12.5
-DEPTHS_M: Final = (2e-6, 6e-6, 2e-5)
-"""Depths of the three presses."""
+DEPTHS_M: Final = (3e-5, 7e-5, 2e-4)
+"""Depths by which the sphere moves into the skin in each press; the electrodes move less."""
 PRESS_S, PAUSE_S = 2.0, 2.0
 
 
@@ -42,7 +42,9 @@ def touch() -> None:
         depth = DEPTHS_M[int(number)] * np.sin(np.pi * phase / PRESS_S) ** 2 if pressed else 0.0
         press = Press((0.018, 0.020), 0.03, max(DEPTHS_M), (0.0, 0.0))
         moved = skin.displacement_m((press,), depth / max(DEPTHS_M))
-        ohm = skin.resistance_ohm(moved) * (1 + 2e-4 * t / 10 + NOISE * rng.standard_normal(skin.rest_ohm.shape))
+        ohm = skin.resistance_ohm(moved) * (
+            1 + 2e-4 * t / 10 + NOISE * rng.standard_normal(skin.rest_ohm.shape)
+        )
         field = tracker.update(ohm)
         times.append(t)
         depths.append(1e6 * float(-moved[..., 2].min()))
@@ -86,13 +88,15 @@ def gripper() -> None:
         hand = parse_hand(table)
         with Fleet(hand, scene=load_scene(path, hand)) as fleet, sk.Host.from_config(hand) as host:
             controller = program["Gripper"](host, "finger", now_ns=clock.monotonic_ns)
-            begun = clock.monotonic()
-            while (t := clock.monotonic() - begun) < 7.0:
+            begun = 1e-9 * clock.monotonic_ns()
+            while (t := 1e-9 * clock.monotonic_ns() - begun) < 7.0:
                 fleet.inject(Faults(unplugged=3.0 < t < 4.0), "finger")
                 field = host.latest("finger")
                 depth, std = np.nan, np.nan
                 if field is not None:
-                    at = np.unravel_index(field.displacement_m[..., 2].argmin(), field.displacement_m.shape[:2])
+                    at = np.unravel_index(
+                        field.displacement_m[..., 2].argmin(), field.displacement_m.shape[:2]
+                    )
                     depth = -1e6 * field.displacement_m[(*at, 2)]
                     std = 1e6 * field.displacement_std_m[(*at, 2)]
                 rows.append((t, depth, std, controller.step()))

@@ -1,4 +1,4 @@
-"""``skinnode hand``: checks or creates a hand file, prints its JSON Schema, or writes ROS 2 packages for it."""
+"""``skinnode hand``: checks or creates a hand file, prints its JSON Schema, or writes ROS 2 packages."""
 
 from __future__ import annotations
 
@@ -215,7 +215,9 @@ def ros2(
     hand: Annotated[Path, typer.Argument(help="The hand.", metavar="HAND.toml")],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help="Existing folder, normally src of a workspace.", metavar="FOLDER"),
+        typer.Option(
+            "--output", "-o", help="Existing folder, normally src of a workspace.", metavar="FOLDER"
+        ),
     ],
 ) -> None:
     """Write two ROS 2 packages: the buses of a hand for ros2_canopen, and the messages skinnode_msgs.
@@ -251,7 +253,9 @@ def _write_new(texts: dict[Path, str], folder: Path) -> None:
     try:
         for file, text in texts.items():
             if file.exists() and file.read_bytes() != text.encode():
-                raise ConfigError("--output", str(file), "no such file, or one with the same content; remove it")
+                raise ConfigError(
+                    "--output", str(file), "no such file, or one with the same content; remove it"
+                )
             file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError("--output", str(folder), f"a writable folder ({error.strerror})") from error

@@ -1,11 +1,12 @@
 """Writes the configuration of ros2_canopen, a CANopen master for ROS 2, for the buses of a hand.
 
-ros2_canopen reads ``bus.yml``; when its package is built, dcfgen of Lely CANopen generates the configuration of
-the master and of each node from ``bus.yml`` and the EDS files. At boot, the master writes to each patch the
-values that the host writes as the NMT master of the bus (:mod:`skinnode.host.configurator`), in the same order.
+ros2_canopen reads ``bus.yml``. When its package is built, dcfgen of Lely CANopen generates the configuration
+of the master and of each node from ``bus.yml`` and the EDS files. At boot, the master writes to each patch
+the values that the host writes as the NMT master of the bus (:mod:`skinnode.host.configurator`), in the same
+order.
 
-The master does not receive the chunks. Otherwise, the proxy driver of ros2_canopen would put every mapped value
-of every chunk into a queue without a limit, from which it takes at most ten values per period
+The master does not receive the chunks. Otherwise, the proxy driver of ros2_canopen would put every mapped
+value of every chunk into a queue without a limit, from which it takes at most ten values per period
 (``node_canopen_base_driver_impl.hpp`` and ``exchange.hpp``, version 0.3.4).
 """
 
@@ -28,8 +29,8 @@ BOOT_TIMEOUT_MS: Final = 3000
 """Time limit (ms) for the boot of a patch, as for the host."""
 
 SDO_TIMEOUT_MS: Final = 200
-"""Time limit (ms) for an SDO response. The default of ros2_canopen, 20 ms, is too short for a Linux board under
-load."""
+"""Time limit (ms) for an SDO response. The default of ros2_canopen, 20 ms, is too short for a Linux board
+under load."""
 
 _RESERVED: Final = ("master", "options")
 """Words that ros2_canopen looks for in the names of devices (``device_container.cpp``)."""
@@ -72,7 +73,7 @@ def package_files(hand: HandConfig) -> dict[str, str]:
 
 
 def package_name(hand: HandConfig) -> str:
-    """Return the name of a hand's package, which has only lower-case letters, digits and single underscores."""
+    """Return the name of a hand's package: lower-case letters, digits and single underscores."""
     name = re.sub("[^a-z0-9]+", "_", hand.name.lower()).strip("_")
     return f"{name}_canopen" if name[:1].isalpha() else f"hand_{name}_canopen".replace("__", "_")
 

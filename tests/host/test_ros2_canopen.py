@@ -31,7 +31,7 @@ KEYS_OF_DEVICE = {
     *("node_id", "serial_number", "dcf", "driver", "package", "heartbeat_producer", "tpdo", "sdo"),
     *("polling", "period", "sdo_timeout_ms", "boot_timeout_ms"),  # read by canopen_base_driver, not by dcfgen
 }
-"""Keys of the user guide of ros2_canopen 0.3.4 (configuration.rst), and of its tests (config/simple/bus.yml)."""
+"""Keys of the user guide of ros2_canopen 0.3.4 (configuration.rst) and its tests (config/simple/bus.yml)."""
 
 CONFIGURED = [
     *((index, 0) for index in (0x1005, 0x1006, 0x1007, 0x1017, 0x1019)),
@@ -186,7 +186,9 @@ def test_what_ros2_canopen_cannot_do_is_refused(bus: dict[str, bool], name: str,
         package_files(parse_hand(table))
 
 
-def test_the_planned_inhibit_time_is_that_of_the_patch_not_of_its_eds(hand: HandConfig, tmp_path: Path) -> None:
+def test_the_planned_inhibit_time_is_that_of_the_patch_not_of_its_eds(
+    hand: HandConfig, tmp_path: Path
+) -> None:
     folder = written(hand, tmp_path)["can0"]
     found = yaml.safe_load((folder / "bus.yml").read_text(encoding="utf-8"))
     chunks = PatchProfile.from_layout(hand.patches[0].layout.build()).n_chunks

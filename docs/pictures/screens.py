@@ -75,7 +75,7 @@ def doctor() -> None:
             for patch, faults in FAULTS.items():
                 fleet.inject(faults, patch)
             run("doctor", str(path), "--active", "--html", str(path.with_name("report.html")))
-        screenshot(path.with_name("report.html"), "doctor", 1000, 900)
+        screenshot(path.with_name("report.html"), "doctor", 1000, 560)
 
 
 def conformance() -> None:

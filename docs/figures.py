@@ -25,7 +25,7 @@ PAGES = (DOCS / "solver.md", DOCS / "solver-figures.md")
 COLOURS = 256
 """Number of colours to which a picture is reduced; the file size decreases to a quarter without a visible
 change."""
-MOST_BYTES = 200_000
+MOST_BYTES = 150_000
 SHORT_NOISE = 1e-5
 """Relative noise of the rows in the short accuracy table."""
 

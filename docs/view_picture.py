@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 from typing import Final
 
+from figures import shrink
 from playwright.sync_api import Route, sync_playwright
 
 from skinnode.demo.hand import demo_hand
@@ -100,6 +101,7 @@ def main() -> None:
                 raise SystemExit("skinnode view did not start")
             shown.stdout.readline()  # the line that reports the end of the recording
             elsewhere = picture_of(found.group(), PICTURE)
+            shrink(PICTURE, PICTURE)
         finally:
             shown.terminate()
             print(shown.communicate()[0])

@@ -56,6 +56,30 @@ def test_files_named_exist(page: Path) -> None:
         assert (package / name).is_file() or (package / "skinnode" / name).is_file(), name
 
 
+PICTURE = re.compile(r"!\[[^\]]{10,}\]\((?:docs/)?img/([\w.-]+)\)")
+"""A picture with a text that describes it."""
+
+
+def guides() -> list[str]:
+    """Pages under "Guides" in the navigation."""
+    nav = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8").split("- Guides:\n")[1]
+    return re.findall(r"^      - .*: (\S+\.md)$", nav.split("\n  - ")[0], flags=re.MULTILINE)
+
+
+def test_every_guide_has_a_picture() -> None:
+    assert len(guides()) > 12
+    for name in [*guides(), "index.md", "first-ten-minutes.md", "concepts.md"]:
+        assert PICTURE.search(text_of(DOCS / name)), name
+
+
+def test_pictures_are_small_and_each_is_shown() -> None:
+    pages = "".join(text_of(page) for page in PAGES)
+    files = {path.name: path for path in (DOCS / "img").iterdir()}
+    assert set(PICTURE.findall(pages)) == set(files)
+    for path in files.values():
+        assert path.stat().st_size <= 150_000, path.name
+
+
 NOT_OURS = re.compile(
     r"\b(told|whoever|dealers?|lanes?|bringers?|rivals?|tells of|comes of)\b", flags=re.IGNORECASE
 )

@@ -260,7 +260,7 @@ def test_stuck_receiver_costs_nobody_else(running: Hand, monkeypatch: pytest.Mon
         port = running.fleet._ports["can0"]
         assert eventually(lambda: port.undelivered > 100)
         assert running.well_again()
-    assert running.host.health("p0").condition is Condition.OPERATIONAL
+    assert eventually(lambda: running.host.health("p0").condition is Condition.OPERATIONAL)
 
 
 def test_host_that_dies_is_followed_by_another(

@@ -172,4 +172,4 @@ def test_messages_that_are_none_harm_nobody(start: Callable[..., Process], port:
         received = before.patches["p0"].received
         eventually(lambda: hand.stats().patches["p0"].received > received + 10)
         assert hand.stats().patches["p0"].lost == 0
-        assert hand.health("p0").condition is Condition.OPERATIONAL
+        eventually(lambda: hand.health("p0").condition is Condition.OPERATIONAL)

@@ -1,1 +1,1 @@
-"""Process-wide facilities: clock, signals, child processes, garbage collection and resource closing."""
+"""Process-wide facilities: clock, signals, child processes, garbage collection and resource cleanup."""

@@ -19,6 +19,8 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 from tests.c_kit import COMPILERS, Kit
 
+from .conftest import eventually
+
 FRACTION_BITS = 8
 """A resistance is a number of 1/256 ohm."""
 TARE_READS = 16
@@ -108,7 +110,7 @@ def test_fields_of_a_board_in_c_are_those_of_a_node_in_python(hand: HandConfig, 
                 if min(map(len, fields.values())) == SCANS:
                     break
             stats = host.stats().patches["p0"].assembler
-            assert host.health("p0").condition is Condition.OPERATIONAL
+            assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
     both = sorted(fields["p0"].keys() & fields["p1"].keys())
     assert len(both) >= SCANS - 1
     for scan in both:

@@ -178,7 +178,7 @@ def test_silence_is_a_timeout_and_a_lost_patch(hand: HandConfig) -> None:
     with Fleet(hand) as fleet, Host.from_config(hand) as host:
         fields = host.fields(timeout_s=0.5)
         take(fields, 4)
-        assert host.health("p0").condition is Condition.OPERATIONAL
+        assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
         fleet.stop()
         with pytest.raises(TimeoutError, match=r"^no field within 0\.5 s$"):
             take(fields, 1000)
@@ -192,10 +192,10 @@ def test_node_that_restarts_by_itself(hand: HandConfig, rack: Rack, caplog: pyte
         rack.pull("p1")
         rack.plug("p1")
         assert eventually(lambda: host.health("p1").boot_ups == boot_ups + 1)
-        assert host.health("p0").condition is Condition.OPERATIONAL
+        assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
         assert eventually(lambda: host.health("p1").rejoins == 1)
         take(host.fields(timeout_s=10, patch="p1"), 4)
-        assert host.health("p1").condition is Condition.OPERATIONAL
+        assert eventually(lambda: host.health("p1").condition is Condition.OPERATIONAL)
     said = [record.getMessage() for record in caplog.records if record.name.startswith("skinnode.")]
     assert said == ["node 6 (p1) restarted without a command", "node 6 (p1) was brought up and is running"]
 

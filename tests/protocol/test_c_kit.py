@@ -167,7 +167,9 @@ def test_files_of_others_are_not_replaced(
         (tmp_path / name).write_text("/* mine */\n")
     assert run("--c", str(tmp_path)) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith(f"error: --c: got '{tmp_path / name}', allowed: no such file, or one that")
+    assert line.startswith(
+        f"error: --c: got '{tmp_path / name}', allowed: no such file, or a file written by"
+    )
     assert [file.name for file in tmp_path.iterdir()] == [name]
 
 

@@ -38,7 +38,7 @@ def test_a_program_has_what_the_host_has(start: Callable[..., Process], port: in
         for name in ("p0", "p1"):
             scans = [field.stamp.scan for field in seen if field.stamp and field.stamp.patch == name]
             assert scans == sorted(set(scans))  # a host that is held up skips scans
-            assert hand.health(name).condition is Condition.OPERATIONAL
+            eventually(lambda name=name: hand.health(name).condition is Condition.OPERATIONAL)
         newest = hand.latest("p0")
         assert newest is not None
         assert newest.trusted
@@ -172,4 +172,4 @@ def test_messages_that_are_none_harm_nobody(start: Callable[..., Process], port:
         received = before.patches["p0"].received
         eventually(lambda: hand.stats().patches["p0"].received > received + 10)
         assert hand.stats().patches["p0"].lost == 0
-        assert hand.health("p0").condition is Condition.OPERATIONAL
+        eventually(lambda: hand.health("p0").condition is Condition.OPERATIONAL)

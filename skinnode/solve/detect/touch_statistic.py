@@ -36,8 +36,8 @@ from skinnode.solve.posterior.load_cells import LoadCells
 
 DEPTH: Final = 5.0
 """RMS normal displacement under the alternative hypothesis, in layer heights times the relative noise. At a
-noise of 1e-3, this is 0.5 % of the layer height. Tests for 0.25 % to 1 % detect touches almost equally well.
-Tests for 2 % or more detect fewer of the presses that are 2 % deep."""
+noise of 1e-3, this is 0.5 % of the layer height. Values from 0.25 % to 1 % work almost equally well; with 2 %
+or more, the test misses more of the presses that are 2 % deep."""
 SHALLOWEST: Final = 0.5
 """Minimum RMS normal displacement considered in the odds, relative to the alternative hypothesis."""
 MOST_OCTAVES: Final = 24

@@ -15,7 +15,7 @@ from pathlib import Path
 from skinnode.demo.hand import demo_hand
 from skinnode.host import Host
 from skinnode.monitor.app import MonitorApp
-from skinnode.monitor.source import HostSource
+from skinnode.monitor.live_source import HostSource
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 

@@ -14,6 +14,7 @@ from skinnode.model.layout import Float
 from skinnode.monitor.view_model import View
 
 _MARKS: Final = {"good": "✔", "note": "●", "bad": "✖"}
+_NONE: Final = "not available"
 _MARKDOWN: Final = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]<>()#+!|~"} | {"\n": " "})
 
 
@@ -86,8 +87,8 @@ def health_text(view: View, counts: DrawnCounts, notes: Iterable[str] = ()) -> s
         (
             f"{_MARKS[bus.level]} {_plain(bus.name)}",
             _plain("; ".join(bus.words) or "no faults"),
-            f"{bus.frames_hz:.0f} /s",
-            f"{100 * bus.load:.0f} %",
+            _NONE if bus.frames_hz is None else f"{bus.frames_hz:.0f} /s",
+            _NONE if bus.load is None else f"{100 * bus.load:.0f} %",
         )
         for bus in view.buses
     ]

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import SkinError
-from skinnode.host import Host, Subscription
+from skinnode.host import Host, RunningHand, Subscription
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import HealthEvent
 from skinnode.host.patch_stream import StreamStats
-from skinnode.host.running_hand import RunningHand
 from skinnode.monitor.source import QUEUED_EVENTS, Arrivals, Recording, Snapshot, drain
 from skinnode.process import clock
 from skinnode.process.closing import Closing
@@ -164,7 +163,7 @@ class RemoteSource(LiveSource):
         remote: Connection to the hand.
     """
 
-    no_recording = "a remote hand cannot be recorded, because its daemon publishes no CAN frames"
+    no_recording = "a remote hand cannot be recorded: run skinnode record --listen on its machine"
     recording = None
 
     def __init__(self, remote: RemoteHand) -> None:

@@ -100,9 +100,7 @@ def _bus_line(bus: BusView, losses: str, theme: Theme, width: int) -> Line:
     well = "no fault reported" if bus.frames_hz is None else "nothing lost"
     line = [
         Segment(f" {bus.name:<6.12}", theme.strong),
-        Segment("load ", theme.dim),
-        *_load(bus.load, theme, 12 if width < 110 else 24),
-        *_frames(bus.frames_hz, theme),
+        *_load_and_rate(bus, theme, 12 if width < 110 else 24),
         Segment("; ".join(words) or well, style),
     ]
     where = [Segment(f"  {bus.where} ({bus.role}) ", theme.dim)]
@@ -111,22 +109,20 @@ def _bus_line(bus: BusView, losses: str, theme: Theme, width: int) -> Line:
     return spread(line, where, width, theme)
 
 
-def _load(load: float | None, theme: Theme, cells: int) -> Line:
-    if load is None:
-        return [Segment("not available  ", theme.dim)]
-    full = min(cells, round(load * cells))
-    style = theme.bad if load > 0.9 else theme.note if load > 0.7 else theme.gauge
-    return [
+def _load_and_rate(bus: BusView, theme: Theme, cells: int) -> Line:
+    if bus.load is None:
+        return [Segment("load and frames/s not available  ", theme.dim)]
+    full = min(cells, round(bus.load * cells))
+    style = theme.bad if bus.load > 0.9 else theme.note if bus.load > 0.7 else theme.gauge
+    line = [
+        Segment("load ", theme.dim),
         Segment("█" * full, style),
         Segment("·" * (cells - full), theme.dim),
-        Segment(f"{100 * load:4.0f} %  ", theme.text),
+        Segment(f"{100 * bus.load:4.0f} %  ", theme.text),
     ]
-
-
-def _frames(frames_hz: float | None, theme: Theme) -> Line:
-    if frames_hz is None:
-        return [Segment("frames/s not available  ", theme.dim)]
-    return [Segment(f"{frames_hz:5.0f}", theme.text), Segment(" frames/s  ", theme.dim)]
+    if bus.frames_hz is None:
+        return [*line, Segment("frames/s not available  ", theme.dim)]
+    return [*line, Segment(f"{bus.frames_hz:5.0f}", theme.text), Segment(" frames/s  ", theme.dim)]
 
 
 def _keys(ui: UiState, theme: Theme, width: int) -> Line:
@@ -191,8 +187,8 @@ def _touches(patches: Sequence[PatchView], scale: Line, theme: Theme, width: int
         pad(_touch_line(patch, touch, theme, name), width, theme) for patch, touch in rows[: height - 1]
     ]
     if not rows:
-        known = any(patch.depth_m is not None for patch in patches)
-        lines.append([Segment(" nothing touches" if known else " nothing known yet", theme.dim)])
+        known = any(patch.depth_m is not None and patch.condition not in GONE for patch in patches)
+        lines.append([Segment(" nothing touches" if known else " nothing known", theme.dim)])
     return [*lines, *([[]] * (height - len(lines)))]
 
 

@@ -174,6 +174,8 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
     now, before, name = history[-1], history[0], patch.name
     health, field, arrivals = now.health[name], now.fields[name], now.arrivals[name]
     condition, level, words = judge_patch(health, _recent_losses(name, now, before))
+    if now.away is not None:
+        words = ("daemon away",)  # the other words describe the past
     surface = None if field is None else surface_of(field, upper_m(patch.layout))
     depth_m = depth_std_m = None
     if field is not None and surface is not None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-import threading
+import signal
+import subprocess
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,14 @@ import pytest
 from textual.pilot import Pilot
 
 import skinnode as sk
-from skinnode.host.running_hand import RunningHand
 from skinnode.monitor.live_source import RemoteSource
 from skinnode.monitor.widgets import Dialog
 from skinnode.view.drawing_thread import DrawingThread
 from skinnode.view.tick import Tick
 from tests.commands import run_here
-from tests.monitor.conftest import eventually as appears
-from tests.monitor.conftest import in_app, press, screen_of
-from tests.remote.conftest import Process, eventually
+from tests.monitor.conftest import PROGRAM, in_app, press, screen_of
+from tests.monitor.conftest import eventually as eventually_in
+from tests.remote.conftest import PATIENCE_S, Process, eventually
 from tests.view.conftest import sdk as sdk
 
 pytestmark = pytest.mark.system_time
@@ -31,43 +31,86 @@ pytestmark = pytest.mark.system_time
 WIDE = (140, 40)
 
 
-def shown(port: int, play: Callable[[Pilot[Any]], Awaitable[None]], **options: Any) -> list[str]:
+def on_screen(port: int, play: Callable[[Pilot[Any]], Awaitable[None]], **options: Any) -> list[str]:
     """Show the hand of a daemon as the command does, and return the faults of the session."""
     with sk.connect("hand", port=port) as hand, RemoteSource(hand) as source:
         return in_app(source, play, size=WIDE, **options).faults.lines
 
 
-def json_lines(port: int, seconds: float, *arguments: str) -> tuple[int, list[dict[str, Any]], str]:
-    done = run_here(
-        "monitor",
-        "--remote",
-        "hand",
-        "--zenoh-port",
-        str(port),
-        "--json",
-        "--seconds",
-        str(seconds),
-        *arguments,
-    )
-    return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
+class Monitor:
+    """``skinnode monitor --json`` in a process of its own."""
+
+    def __init__(self, port: int) -> None:
+        arguments = ["--remote", "hand", "--zenoh-port", str(port), "--json"]
+        self.lines: list[dict[str, Any]] = []
+        self._process = subprocess.Popen(
+            [*PROGRAM, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def until(self, happens: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        """Read lines until ``happens(line)`` is true; return that line."""
+        assert self._process.stdout is not None
+        for text in self._process.stdout:
+            self.lines.append(json.loads(text))
+            if happens(self.lines[-1]):
+                return self.lines[-1]
+        raise AssertionError(self._process.communicate()[1])
+
+    def stop(self) -> tuple[int, list[str]]:
+        """Press Ctrl-C; return the exit status and the lines on stderr."""
+        self._process.send_signal(signal.SIGINT)
+        return self.end()
+
+    def kill(self) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.communicate()
+
+    def end(self) -> tuple[int, list[str]]:
+        """Wait for the end; return the exit status and the lines on stderr."""
+        _, said = self._process.communicate(timeout=PATIENCE_S)
+        return self._process.returncode, said.splitlines()
 
 
-def test_programs_can_use_either_hand_in_the_same_way() -> None:
-    for kind in (sk.Host, sk.RemoteHand):
-        assert issubclass(kind, RunningHand)
-        for name in ("fields", "hands", "on_field", "latest", "events"):
-            assert getattr(kind, name) is getattr(RunningHand, name)
+@pytest.fixture
+def monitor(port: int) -> Iterator[Callable[[], Monitor]]:
+    """Start the command; all that still run are killed at the end."""
+    running: list[Monitor] = []
+
+    def run_one() -> Monitor:
+        running.append(Monitor(port))
+        return running[-1]
+
+    yield run_one
+    for each in running:
+        each.kill()
 
 
-def test_json_says_what_a_daemon_does_not_send(start: Callable[..., Process], port: int) -> None:
+def conditions(line: dict[str, Any]) -> set[str]:
+    return {patch["condition"] for patch in line["patches"].values()}
+
+
+def refused(port: int) -> tuple[int, list[str], str]:
+    done = run_here("monitor", "--remote", "hand", "--zenoh-port", str(port), "--json", "--seconds", "1")
+    return done.returncode, done.stdout.splitlines(), done.stderr
+
+
+async def appears(pilot: Pilot[Any], happens: Callable[[], object]) -> bool:
+    return await eventually_in(pilot, happens, within_s=PATIENCE_S)
+
+
+def test_json_says_what_a_daemon_does_not_send(
+    start: Callable[..., Process], monitor: Callable[[], Monitor]
+) -> None:
     daemon = start(period_ms=100).wait_until_up()
-    _, lines, _ = json_lines(port, 3.0)
-    newest = lines[-1]
+    shown = monitor()
+    newest = shown.until(lambda line: len(shown.lines) > 2 and line["fields_hz"] > 0)
+    shown.stop()
     assert newest["away"] is None
     assert set(newest["patches"]) == {"p0", "p1"}
     for patch in newest["patches"].values():
         assert patch["condition"] == "operational"
-        assert patch["rate_hz"] == pytest.approx(10.0, rel=0.3)
+        assert 0 < patch["rate_hz"] < 15  # a host that is held up skips scans
         assert patch["fields_lost"] == 0
         assert 0 < patch["transit_s"] < 5
         assert 0 < patch["latency_s"] < 5
@@ -100,13 +143,13 @@ def test_the_screen_of_a_remote_hand(start: Callable[..., Process], port: int) -
         for key, said in (
             ("t", "hand 'hand': its daemon does not accept commands; start it with skinnode host --publish"),
             ("n", "hand 'hand': its daemon does not accept commands; start it with skinnode host --publish"),
-            ("r", "a remote hand cannot be recorded, because its daemon publishes no CAN frames"),
+            ("r", "a remote hand cannot be recorded: run skinnode record --listen on its machine"),
         ):
             pilot.app.simulate_key(key)
             assert await appears(pilot, lambda said=said: said in screen_of(pilot).split("\n")[-1])
             assert not isinstance(pilot.app.screen, Dialog)
 
-    shown(port, play)
+    on_screen(port, play)
 
 
 def test_keys_command_the_nodes_of_a_remote_hand(start: Callable[..., Process], port: int) -> None:
@@ -118,7 +161,7 @@ def test_keys_command_the_nodes_of_a_remote_hand(start: Callable[..., Process], 
         assert isinstance(pilot.app.screen, Dialog)
         assert "Tare p1?" in pilot.app.screen.text
         await press(pilot, "y")
-        assert await appears(pilot, lambda: "p1: tared; the new baseline is in use" in screen_of(pilot), 30.0)
+        assert await appears(pilot, lambda: "p1: tared; the new baseline is in use" in screen_of(pilot))
         baselines = json.loads(await asyncio.to_thread(daemon.tell, "baselines"))
         assert (baselines["p0"], baselines["p1"] > 0) == (0, True)
         pilot.app.simulate_key("n")
@@ -128,11 +171,11 @@ def test_keys_command_the_nodes_of_a_remote_hand(start: Callable[..., Process], 
         assert await appears(
             pilot, lambda: "p1: reset; the host brings its node up again" in screen_of(pilot)
         )
-        assert await appears(pilot, lambda: "p1 1 rejoin" in screen_of(pilot), 30.0)
+        assert await appears(pilot, lambda: "p1 1 rejoin" in screen_of(pilot))
         after = json.loads(await asyncio.to_thread(daemon.tell, "boot_ups"))
         assert (after["p0"], after["p1"] > boot_ups["p1"]) == (boot_ups["p0"], True)
 
-    shown(port, play)
+    on_screen(port, play)
 
 
 def test_the_screen_says_that_the_daemon_is_away_and_goes_on_when_it_is_back(
@@ -145,56 +188,60 @@ def test_the_screen_says_that_the_daemon_is_away_and_goes_on_when_it_is_back(
         await asyncio.to_thread(daemon.kill)
         assert await appears(pilot, lambda: "DAEMON AWAY" in screen_of(pilot))
         text = screen_of(pilot)
-        assert "load not available" in text
+        assert "load and frames/s not available" in text
         assert "away: no daemon has published hand 'hand' for" in text
-        assert text.count(" lost ") >= 4  # across each map and below it
+        assert text.count("lost: daemon away") == 2
+        assert "nothing known" in text
+        assert "nothing touches" not in text
         assert await appears(
             pilot, lambda: "host no daemon has published hand 'hand' for" in screen_of(pilot)
         )
         pilot.app.simulate_key("t")
         assert await appears(pilot, lambda: "does not accept commands" in screen_of(pilot).split("\n")[-1])
         await asyncio.to_thread(lambda: (daemon.start(), daemon.wait_until_up()))
-        assert await appears(pilot, lambda: "host its daemon is back" in screen_of(pilot), 30.0)
-        assert await appears(pilot, lambda: screen_of(pilot).count("operational") >= 2, 30.0)
+        assert await appears(pilot, lambda: "host its daemon is back" in screen_of(pilot))
+        assert await appears(pilot, lambda: screen_of(pilot).count("operational") >= 2)
         assert "DAEMON AWAY" not in screen_of(pilot)
 
-    faults = shown(port, play)
+    faults = on_screen(port, play)
     assert {"p0: lost", "p1: lost"} <= set(faults)
     assert any(line.startswith("can0: away: no daemon has published hand 'hand' for") for line in faults)
 
 
-def test_json_goes_on_while_the_daemon_is_away(start: Callable[..., Process], port: int) -> None:
+def test_json_goes_on_when_the_daemon_is_back(
+    start: Callable[..., Process], monitor: Callable[[], Monitor]
+) -> None:
     daemon = start(period_ms=100).wait_until_up()
-    killer = threading.Timer(2.0, daemon.kill)
-    killer.start()
-    status, lines, said = json_lines(port, 5.0)
-    killer.join()
+    shown = monitor()
+    shown.until(lambda line: conditions(line) == {"operational"})
+    daemon.kill()
+    away = shown.until(lambda line: line["away"] and line["fields_hz"] == 0)
+    daemon.start()
+    daemon.wait_until_up()
+    shown.until(lambda line: line["away"] is None and conditions(line) == {"operational"})
+    status, said = shown.stop()
     assert status == 1
-    newest = lines[-1]
-    assert newest["away"].startswith("no daemon has published hand 'hand' for ")
-    assert newest["buses"]["can0"]["load"] is None
-    assert {patch["condition"] for patch in newest["patches"].values()} == {"lost"}
-    events = [event for line in lines for event in line["events"]]
+    assert away["away"].startswith("no daemon has published hand 'hand' for ")
+    assert away["buses"]["can0"]["load"] is None
+    assert conditions(away) == {"lost"}
+    events = [event for line in shown.lines for event in line["events"]]
     assert sum(event.startswith("host: no daemon has published hand") for event in events) == 1
-    assert {"fault: p0: lost", "fault: p1: lost"} <= set(said.splitlines())
+    assert "host: its daemon is back" in events
+    assert {"fault: p0: lost", "fault: p1: lost"} <= set(said)
 
 
 @pytest.mark.long
-def test_a_daemon_with_another_hand_ends_the_screen_with_one_line(
-    start: Callable[..., Process], port: int
+def test_a_daemon_with_another_hand_is_one_line(
+    start: Callable[..., Process], monitor: Callable[[], Monitor]
 ) -> None:
     first = start().wait_until_up()
-
-    def replace() -> None:
-        first.kill()
-        start(patches=3).wait_until_up()
-
-    killer = threading.Timer(1.0, replace)
-    killer.start()
-    status, _, said = json_lines(port, 60.0)
-    killer.join()
+    shown = monitor()
+    shown.until(lambda line: conditions(line) == {"operational"})
+    first.kill()
+    start(patches=3).wait_until_up()
+    status, said = shown.end()
     assert status == 2
-    assert said == ("error: hand 'hand': its daemon has restarted with another hand file; connect again\n")
+    assert said == ["error: hand 'hand': its daemon has restarted with another hand file; connect again"]
 
 
 @pytest.mark.parametrize("command", ["monitor", "view"])
@@ -230,7 +277,7 @@ def test_a_wrong_option_is_one_line(
 
 def test_a_wrong_name_is_one_line(start: Callable[..., Process], port: int) -> None:
     start(name="left hand").wait_until_up()
-    status, lines, said = json_lines(port, 1.0)
+    status, lines, said = refused(port)
     assert (status, lines) == (2, [])
     assert said == "error: hand: got 'hand', allowed: one of the published hands: 'left hand'\n"
 
@@ -239,7 +286,7 @@ def test_a_missing_extra_is_one_line(port: int, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(
         "skinnode.remote.session.find_spec", lambda name: None if name == "zenoh" else find_spec(name)
     )
-    status, lines, said = json_lines(port, 1.0)
+    status, lines, said = refused(port)
     assert (status, lines) == (2, [])
     assert said == (
         "error: --remote: got no package eclipse-zenoh, allowed: the packages of the extra zenoh "

@@ -35,6 +35,8 @@ def contacts_text(frame: HandFrame) -> str:
     Args:
         frame: Newest fields of all patches.
     """
+    if not frame.fields:
+        return "No patch has a current field."
     wrenches = [*frame.wrenches.values(), frame.wrench]
     names = [*frame.wrenches, "whole hand"]
     one = len(frame.wrenches) == 1  # the wrench of a single link is the hand's in another coordinate frame

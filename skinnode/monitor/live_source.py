@@ -37,9 +37,7 @@ class LiveSource(Closing):
         self.hand, self.title = running.hand, title
         self._running = running
         self._events = running.events(capacity=QUEUED_EVENTS)
-        self._fields = running.fields(
-            capacity=_CAPACITY
-        )  # the queue also receives the error if the hand fails
+        self._fields = running.fields(capacity=_CAPACITY)  # also receives the error that stops the hand
 
     def events(self) -> list[HealthEvent]:
         """Return the events that have occurred since the last call."""

@@ -33,7 +33,7 @@ WIDE = (140, 40)
 
 def on_screen(port: int, play: Callable[[Pilot[Any]], Awaitable[None]], **options: Any) -> list[str]:
     """Show the hand of a daemon as the command does, and return the faults of the session."""
-    with sk.connect("hand", port=port) as hand, RemoteSource(hand) as source:
+    with sk.connect("hand", port=port, timeout_s=PATIENCE_S) as hand, RemoteSource(hand) as source:
         return in_app(source, play, size=WIDE, **options).faults.lines
 
 
@@ -302,7 +302,7 @@ def test_the_drawing_of_a_remote_hand(start: Callable[..., Process], port: int) 
     def views() -> list[Any]:
         return [tick.view for tick in ticks if tick.view is not None]
 
-    with sk.connect("hand", port=port) as hand, RemoteSource(hand) as source:
+    with sk.connect("hand", port=port, timeout_s=PATIENCE_S) as hand, RemoteSource(hand) as source:
         every = hand.fields(capacity=10_000)
         with DrawingThread(source, ticks.append, rate_hz=200.0) as thread:
             eventually(lambda: thread.counts.drawn > 20)

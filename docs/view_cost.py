@@ -24,7 +24,7 @@ import numpy as np
 from skinnode.bench.load import LEAD_S, Generator
 from skinnode.bench.pipeline import _hand, _Reader, _settle
 from skinnode.host import Host
-from skinnode.monitor.source import HostSource
+from skinnode.monitor.live_source import HostSource
 from skinnode.process.garbage_collection import responsive_threads, without_long_collections
 from skinnode.transport.datagram import DatagramPort
 from skinnode.view.drawing_process import DrawingOptions, DrawingProcess

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from skinnode.host import HandFrame, Host
+    from skinnode.host import HandFrame, Host, RunningHand
     from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
     from skinnode.model.elastic import Rubber
     from skinnode.model.forward import jacobian, resistance_ohm
@@ -35,6 +35,7 @@ _HOME = {
     "HandContact": "skinnode.model.hand_contact",
     "HandFrame": "skinnode.host",
     "Host": "skinnode.host",
+    "RunningHand": "skinnode.host",
     "PatchLayout": "skinnode.model.layout",
     "Rubber": "skinnode.model.elastic",
     "resistance_ohm": "skinnode.model.forward",
@@ -90,6 +91,7 @@ __all__ = [
     "RemoteHand",
     "ResistanceFrame",
     "Rubber",
+    "RunningHand",
     "ScanStamp",
     "SolveStats",
     "Status",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from skinnode.cli._run_report import Report
+    from skinnode.cli._zenoh_options import ZenohOptions
     from skinnode.config import HandConfig
     from skinnode.host import Host
     from skinnode.remote import SessionOptions
@@ -26,26 +26,6 @@ Listen = Annotated[
     str | None,
     typer.Option(help="With --publish: another endpoint, such as tls/0.0.0.0:7447.", metavar="ENDPOINT"),
 ]
-Router = Annotated[
-    str | None,
-    typer.Option(help="With --publish: Zenoh router, such as tcp/192.168.1.5:7447.", metavar="ENDPOINT"),
-]
-ZenohConfig = Annotated[
-    Path | None,
-    typer.Option(help="With --publish: Zenoh configuration with TLS and access control.", metavar="FILE"),
-]
-Port = Annotated[
-    int | None, typer.Option(help="With --publish: first of 16 ports on this machine; default 17447.")
-]
-
-
-class Connections(NamedTuple):
-    """Values of the options for connections; None if not given."""
-
-    listen: str | None
-    router: str | None
-    zenoh_config: Path | None
-    port: int | None
 
 
 class AskedPublication:
@@ -87,7 +67,7 @@ class AskedPublication:
         report.note(f"published {counted(sum(stats.published.values()), 'field')}; dropped {stats.dropped}")
 
 
-def asked_publication(connections: Connections, *, publish: bool, commands: bool) -> AskedPublication:
+def asked_publication(connections: ZenohOptions, *, publish: bool, commands: bool) -> AskedPublication:
     """Return the publication requested by the options.
 
     Raises:
@@ -96,17 +76,12 @@ def asked_publication(connections: Connections, *, publish: bool, commands: bool
     from skinnode.errors import ConfigError, Shown
 
     if not publish:
-        asked = {**connections._asdict(), "commands": commands or None}
-        for name, value in asked.items():
-            if value is not None:
-                option = f"--{name.replace('_', '-')}"
-                got = Shown("it") if value is True else value if isinstance(value, int) else str(value)
-                raise ConfigError(option, got, "only with --publish")
+        connections.require_unused("only with --publish")
+        if commands:
+            raise ConfigError("--commands", Shown("it"), "only with --publish")
         return AskedPublication(None, commands=False)
-    from skinnode.remote.session import PORT, SessionOptions, require_protected, require_zenoh
+    options = connections.session("--publish")
+    from skinnode.remote.session import require_protected
 
-    require_zenoh("--publish")
-    listen, router, config, port = connections
-    options = SessionOptions(router, listen, config, PORT if port is None else port)
     require_protected(options, commands=commands)
     return AskedPublication(options, commands=commands)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from contextlib import ExitStack
 
+    from skinnode.cli._zenoh_options import ZenohOptions
     from skinnode.config import HandConfig
     from skinnode.monitor.source import Source
 
@@ -33,44 +36,141 @@ Simulate = Annotated[
         help="Simulate pressed patches on a private bus: the hand's patches, or four without a hand.",
     ),
 ]
+Remote = Annotated[
+    str | None,
+    typer.Option(help="Show the hand of this name that `skinnode host --publish` publishes.", metavar="NAME"),
+]
 
 
-def require_one_source(hand: Path | None, replay: Path | None, *, simulate: bool) -> None:
-    """Raise ConfigError unless the options select exactly one source: a hand or a recording."""
+class WatchOptions(NamedTuple):
+    """Values of the options that select the hand to watch."""
+
+    hand: Path | None
+    interface: str | None
+    channel: str | None
+    replay: Path | None
+    speed: float | None
+    simulate: bool
+    remote: str | None
+    zenoh: ZenohOptions
+
+
+class WatchedSource(NamedTuple):
+    """Hand to watch, before its source is started."""
+
+    hand: HandConfig
+    name: str
+    wall_minus_mono_ns: int
+    """Wall-clock time minus the time on the monotonic clock of the source, in ns."""
+    start: Callable[[ExitStack, threading.Event, Callable[[str], None]], Source]
+    """Function that starts the source. Closing the stack also closes the source; the event cancels the start;
+    the last argument displays the current step. Raises the same errors as :meth:`Host.from_config`."""
+
+
+def check_options(options: WatchOptions) -> None:
+    """Raise ConfigError unless the options select exactly one source and each option has an effect."""
     from skinnode.errors import NOTHING, ConfigError, Shown
 
-    if (hand is not None or simulate) == (replay is not None):
-        got = NOTHING if replay is None else Shown("both it and --replay")
-        raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
+    sources = {
+        "HAND.toml": options.hand is not None or options.simulate,
+        "--replay": options.replay is not None,
+        "--remote": options.remote is not None,
+    }
+    given = [name for name, is_given in sources.items() if is_given]
+    if len(given) != 1:
+        key, got = (given[0], Shown(f"both it and {given[1]}")) if given else ("HAND.toml", NOTHING)
+        raise ConfigError(key, got, "one of HAND.toml, --simulate, --replay RECORDING and --remote NAME")
+    if options.speed is not None and options.replay is None:
+        raise ConfigError("--speed", options.speed, "only with --replay")
+    if options.remote is None:
+        options.zenoh.require_unused("only with --remote")
+    unused = given[0] if given[0] != "HAND.toml" else "--simulate" if options.simulate else None
+    for option, value in (("--interface", options.interface), ("--channel", options.channel)):
+        if value is not None and unused is not None:
+            raise ConfigError(option, value, f"only without {unused}, which opens no bus of a hand")
 
 
-def require_used(
-    interface: str | None, channel: str | None, speed: float | None, *, played: bool, simulated: bool
-) -> None:
-    """Raise ConfigError if an option would have no effect on a recording or a simulated hand."""
-    from skinnode.errors import ConfigError
+@contextmanager
+def watched(options: WatchOptions, tell: Callable[[str], None]) -> Iterator[WatchedSource]:
+    """Load the hand file, open the recording or connect to the remote hand; close it on exit.
 
-    if speed is not None and not played:
-        raise ConfigError("--speed", speed, "only with --replay")
-    for option, value in (("--interface", interface), ("--channel", channel)):
-        if value is not None and (played or simulated):
-            allowed = f"only without {'--replay' if played else '--simulate'}, which opens no bus of a hand"
-            raise ConfigError(option, value, allowed)
+    Args:
+        options: Options that :func:`check_options` accepts.
+        tell: Function that displays the current step.
+
+    Raises:
+        ConfigError: The hand file or the recording cannot be read, or the remote hand is not published.
+        SkinError: The daemon of the remote hand does not answer.
+    """
+    if options.remote is not None:
+        with _remote(options.remote, options.zenoh, tell) as source:
+            yield source
+    elif options.replay is not None:
+        with _recording(options.replay, 1.0 if options.speed is None else options.speed) as source:
+            yield source
+    else:
+        yield _host(options)
 
 
-def plan_of(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
+@contextmanager
+def _remote(name: str, zenoh: ZenohOptions, tell: Callable[[str], None]) -> Iterator[WatchedSource]:
+    import time
+
+    session = zenoh.session("--remote")
+    from skinnode.monitor.live_source import RemoteSource
+    from skinnode.remote import connect
+
+    tell(f"connecting to {name!r}")
+    with connect(name, router=session.router, config=session.config, port=session.port) as remote:
+        yield WatchedSource(
+            remote.hand,
+            remote.hand.name,
+            time.time_ns() - time.monotonic_ns(),
+            lambda stack, stop, tell: stack.enter_context(RemoteSource(remote)),
+        )
+
+
+@contextmanager
+def _recording(path: Path, speed: float) -> Iterator[WatchedSource]:
+    from skinnode.monitor.replay_source import ReplaySource
+    from skinnode.record import replay
+
+    run = replay(path, speed=speed)
+    try:
+        yield WatchedSource(
+            run.hand,
+            path.name,
+            run.wall_minus_mono_ns,
+            lambda stack, stop, tell: stack.enter_context(ReplaySource(run)),
+        )
+    finally:
+        run.log.close()
+
+
+def _host(options: WatchOptions) -> WatchedSource:
+    import time
+
+    plan = _plan(options)
+
+    def start(stack: ExitStack, stop: threading.Event, tell: Callable[[str], None]) -> Source:
+        return _running(stack, plan, stop, simulate=options.simulate, tell=tell)
+
+    return WatchedSource(plan, plan.name, time.time_ns() - time.monotonic_ns(), start)
+
+
+def _plan(options: WatchOptions) -> HandConfig:
     """Return the hand to run, with settings that make the host wait for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 
-    if hand is not None:
-        plan = load_hand(hand).on(interface, channel)
+    if options.hand is not None:
+        plan = load_hand(options.hand).on(options.interface, options.channel)
     else:
         plan = demo_hand(_SIMULATED, seed=1)
         # only the "posterior" method computes contact forces
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
-    if simulate:
+    if options.simulate:
         from skinnode.demo.simulated import on_simulated_buses
 
         plan = on_simulated_buses(plan)
@@ -78,7 +178,7 @@ def plan_of(hand: Path | None, interface: str | None, channel: str | None, simul
     return plan.model_copy(update={"bring_up": waiting})
 
 
-def running(
+def _running(
     stack: ExitStack,
     plan: HandConfig,
     stop: threading.Event,
@@ -86,21 +186,11 @@ def running(
     simulate: bool,
     tell: Callable[[str], None],
 ) -> Source:
-    """Return a source that runs a host; closing ``stack`` also closes the source.
-
-    Raises the same errors as :meth:`Host.from_config`.
-
-    Args:
-        stack: Stack that closes the resources opened here.
-        plan: The hand.
-        stop: Event that cancels the start.
-        simulate: Whether to simulate the patches.
-        tell: Function that displays the current step.
-    """
+    """Start a host and return its source; see :class:`WatchedSource`."""
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
     from skinnode.host.scan_solver import check_solvable
-    from skinnode.monitor.source import HostSource
+    from skinnode.monitor.live_source import HostSource
     from skinnode.process.garbage_collection import responsive_threads, without_long_collections
     from skinnode.text.words import counted
 
@@ -116,11 +206,3 @@ def running(
     stack.enter_context(without_long_collections())  # collects garbage now, before the first SYNC
     host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
-
-
-def recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """Return a source that plays a recording; closing ``stack`` also closes the source."""
-    from skinnode.monitor.source import ReplaySource
-    from skinnode.record import replay
-
-    return stack.enter_context(ReplaySource(replay(path, speed=speed)))

@@ -10,17 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
-from skinnode.cli._publish import (
-    AskedPublication,
-    Commands,
-    Connections,
-    Listen,
-    Port,
-    Publish,
-    Router,
-    ZenohConfig,
-    asked_publication,
-)
+from skinnode.cli._publish import AskedPublication, Commands, Listen, Publish, asked_publication
+from skinnode.cli._zenoh_options import Router, ZenohConfig, ZenohOptions, ZenohPort
 
 if TYPE_CHECKING:
     from skinnode.cli._run_report import Report
@@ -43,7 +34,7 @@ def host(
     listen: Listen = None,
     router: Router = None,
     zenoh_config: ZenohConfig = None,
-    port: Port = None,
+    zenoh_port: ZenohPort = None,
 ) -> None:
     """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
 
@@ -59,7 +50,7 @@ def host(
     from skinnode.config import load_hand
 
     plan = load_hand(hand).on(interface, channel)  # before the imports that take a second
-    connections = Connections(listen, router, zenoh_config, port)
+    connections = ZenohOptions(router, zenoh_config, zenoh_port, listen)
     published = asked_publication(connections, publish=publish, commands=commands)
     from skinnode.cli._run_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold

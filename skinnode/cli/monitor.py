@@ -13,21 +13,20 @@ import typer
 
 from skinnode.cli._options import OtherChannel, OtherInterface
 from skinnode.cli._watched_hand import (
+    Remote,
     Replayed,
     Simulate,
     Speed,
     WatchedHand,
-    plan_of,
-    recording,
-    require_one_source,
-    require_used,
-    running,
+    WatchOptions,
+    check_options,
+    watched,
 )
+from skinnode.cli._zenoh_options import Router, ZenohConfig, ZenohOptions, ZenohPort
 
 if TYPE_CHECKING:
     import threading
 
-    from skinnode.config import HandConfig
     from skinnode.monitor.source import Source
 
 
@@ -38,6 +37,10 @@ def monitor(
     replay: Replayed = None,
     speed: Speed = None,
     simulate: Simulate = False,
+    remote: Remote = None,
+    router: Router = None,
+    zenoh_config: ZenohConfig = None,
+    zenoh_port: ZenohPort = None,
     output: Annotated[
         str,  # Path would turn an empty string into the current folder
         typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
@@ -54,29 +57,35 @@ def monitor(
 ) -> None:
     """Show a hand in the terminal: depth and shear maps, touches, health, rates, load, events.
 
-    The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
-    patch, z shows only the selected patch, t tares the selected patch, r records, space freezes the picture,
-    ? shows help, q quits. The screen requires the optional packages of the extra `tui`. The exit status is 0
-    if no fault occurred, 1 if any fault occurred (faults are printed at the end), 2 if the monitor could not
-    run.
+    The command runs the hand as `skinnode host` does, but waits for missing patches. With --remote, it shows
+    a hand that another process runs. Keys: 1-9 select a patch, z shows only the selected patch, t tares the
+    selected patch, n resets its node, r records, space freezes the picture, ? shows help, q quits. The screen
+    requires the optional packages of the extra `tui`. The exit status is 0 if no fault occurred, 1 if any
+    fault occurred (faults are printed at the end), 2 if the monitor could not run.
     """
+    from skinnode.cli._console import progress
     from skinnode.errors import ConfigError
 
     if not as_json:
         _require_screen()
-    require_one_source(hand, replay, simulate=simulate)
-    require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
+    zenoh = ZenohOptions(router, zenoh_config, zenoh_port)
+    options = WatchOptions(hand, interface, channel, replay, speed, simulate, remote, zenoh)
+    check_options(options)
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise ConfigError("--output", output, "a folder name; the first recording creates the folder")
     from skinnode.host import BringUpCancelled
     from skinnode.process.signals import stop_on_signal
 
-    with stop_on_signal() as stop, ExitStack() as stack:
+    with ExitStack() as opened:
+        with progress(as_json) as tell:
+            source_of = opened.enter_context(watched(options, tell))
+        stop = opened.enter_context(stop_on_signal())
+        stack = opened.enter_context(ExitStack())
+        if not as_json:
+            import skinnode.monitor.app  # noqa: F401  # slow, so import it before deadlines apply
         try:
-            if replay is not None:
-                source = recording(stack, replay, 1.0 if speed is None else speed)
-            else:
-                source = _running(stack, plan_of(hand, interface, channel, simulate), stop, simulate, as_json)
+            with progress(as_json) as tell:
+                source = source_of.start(stack, stop, tell)
         except BringUpCancelled:
             return
         faults = _print(source, stop, seconds) if as_json else _show(source, stop, seconds, Path(output))
@@ -98,19 +107,6 @@ def _require_screen() -> None:
         raise ConfigError("skinnode monitor", Shown("no package textual"), allowed)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("standard input and output", Shown("no terminal"), "a terminal, or --json")
-
-
-def _running(
-    stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
-) -> Source:
-    """Import the screen, which is slow, and return a source that runs a host."""
-    from skinnode.cli._console import progress
-
-    if not quiet:
-        import skinnode.monitor.app  # noqa: F401  # slow, so import it before deadlines apply
-
-    with progress(quiet) as tell:
-        return running(stack, plan, stop, simulate=simulate, tell=tell)
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:

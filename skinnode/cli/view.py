@@ -11,20 +11,21 @@ import typer
 
 from skinnode.cli._options import OtherChannel, OtherInterface, Seconds
 from skinnode.cli._watched_hand import (
+    Remote,
     Replayed,
     Simulate,
     Speed,
     WatchedHand,
-    plan_of,
-    require_one_source,
-    require_used,
-    running,
+    WatchedSource,
+    WatchOptions,
+    check_options,
+    watched,
 )
+from skinnode.cli._zenoh_options import Router, ZenohConfig, ZenohOptions, ZenohPort
 
 if TYPE_CHECKING:
     import threading
 
-    from skinnode.config import HandConfig
     from skinnode.errors import SkinError
     from skinnode.monitor.source import Source
     from skinnode.view.drawing_process import DrawingProcess
@@ -54,6 +55,10 @@ def view(
     replay: Replayed = None,
     speed: Speed = None,
     simulate: Simulate = False,
+    remote: Remote = None,
+    router: Router = None,
+    zenoh_config: ZenohConfig = None,
+    zenoh_port: ZenohPort = None,
     web: Annotated[
         bool, typer.Option("--web", help="Show the hand in a browser instead of a window.")
     ] = False,
@@ -88,17 +93,18 @@ def view(
 ) -> None:
     """Show a hand in 3-D: pressed surfaces, shear, contacts and forces, health, events and plots over time.
 
-    The command runs the hand like `skinnode host`, but waits for missing patches. With neither --web nor
-    --save, it opens a window and ends when the window is closed. With only --replay and --save, it converts
-    the whole recording as fast as possible. Requires the optional packages of the `view` extra. The exit
-    status is 0 if no fault occurred, 1 if any fault occurred (the faults are printed at the end), and 2 if
-    the command could not run.
+    The command runs the hand like `skinnode host`, but waits for missing patches. With --remote, it shows a
+    hand that another process runs. With neither --web nor --save, it opens a window and ends when the window
+    is closed. With only --replay and --save, it converts the whole recording as fast as possible. Requires
+    the optional packages of the `view` extra. The exit status is 0 if no fault occurred, 1 if any fault
+    occurred (the faults are printed at the end), and 2 if the command could not run.
     """
     from skinnode.errors import ConfigError
 
     _require_viewer()
-    require_one_source(hand, replay, simulate=simulate)
-    require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
+    zenoh = ZenohOptions(router, zenoh_config, zenoh_port)
+    options = WatchOptions(hand, interface, channel, replay, speed, simulate, remote, zenoh)
+    check_options(options)
     for option, value in (("--address", address), ("--port", port)):
         if value is not None and not web:
             raise ConfigError(option, value, "only with --web")
@@ -107,30 +113,24 @@ def view(
 
     if save is not None and not save.endswith(SUFFIX):  # Path would turn an empty string into a folder
         raise ConfigError("--save", save, f"a file name that ends in {SUFFIX}")
-    options = OutputOptions(
+    outputs = OutputOptions(
         window=not web and save is None,
         web=web,
         save=None if save is None else Path(save),
         address=LOCAL if address is None else address,
         port=PORT if port is None else port,
     )
-    drawing = _Drawing(options, rate, exaggerate, seconds)
-    from skinnode.host import BringUpCancelled
+    drawing = _Drawing(outputs, rate, exaggerate, seconds)
     from skinnode.process.signals import stop_on_signal
 
-    with stop_on_signal() as stop, ExitStack() as stack:
-        try:
-            if replay is not None and save is not None and speed is None and not web:
-                faults, counts = _convert(replay, Path(save), stop, exaggerate)
-            else:
-                if replay is not None:
-                    shown = _replaying(stack, replay, 1.0 if speed is None else speed, drawing)
-                else:
-                    plan = plan_of(hand, interface, channel, simulate)
-                    shown = _live(stack, plan, drawing, stop, simulate=simulate)
-                faults, counts = _show(*shown, stop, drawing)
-        except BringUpCancelled:
+    if replay is not None and save is not None and speed is None and not web:
+        with stop_on_signal() as stop:
+            faults, counts = _convert(replay, Path(save), stop, exaggerate)
+    else:
+        shown = _watch(options, drawing)
+        if shown is None:
             return
+        faults, counts = shown
     _report(faults, counts)
 
 
@@ -150,41 +150,32 @@ def _open(stack: ExitStack, options: OutputOptions) -> Output:
     return output
 
 
-def _live(
-    stack: ExitStack, plan: HandConfig, drawing: _Drawing, stop: threading.Event, *, simulate: bool
-) -> tuple[Output, DrawingProcess, Source]:
-    """Open the output, start the drawing process and run the hand; return all three."""
-    import time
-
+def _watch(options: WatchOptions, drawing: _Drawing) -> tuple[list[str], DrawnCounts] | None:
+    """Draw a hand until drawing stops; return the faults and field counts, None if the start is cancelled."""
     from skinnode.cli._console import progress
+    from skinnode.host import BringUpCancelled
+    from skinnode.process.signals import stop_on_signal
 
-    output = _open(stack, drawing.output)
-    process = _draw_on(stack, output, plan, plan.name, drawing, time.time_ns() - time.monotonic_ns())
-    with progress() as tell:
-        return output, process, running(stack, plan, stop, simulate=simulate, tell=tell)
-
-
-def _replaying(
-    stack: ExitStack, path: Path, speed: float, drawing: _Drawing
-) -> tuple[Output, DrawingProcess, Source]:
-    """Open the output, start the drawing process and play the recording; return all three."""
-    from skinnode.monitor.source import ReplaySource
-    from skinnode.record import replay
-
-    run = replay(path, speed=speed)
-    stack.callback(run.log.close)
-    output = _open(stack, drawing.output)
-    process = _draw_on(stack, output, run.hand, path.name, drawing, run.wall_minus_mono_ns)
-    return output, process, stack.enter_context(ReplaySource(run))
+    with ExitStack() as opened:
+        with progress() as tell:
+            source_of = opened.enter_context(watched(options, tell))
+        stop = opened.enter_context(stop_on_signal())
+        stack = opened.enter_context(ExitStack())
+        output = _open(stack, drawing.output)
+        process = _draw_on(stack, output, source_of, drawing)
+        try:
+            with progress() as tell:
+                source = source_of.start(stack, stop, tell)
+        except BringUpCancelled:
+            return None
+        return _show(output, process, source, stop, drawing)
 
 
-def _draw_on(
-    stack: ExitStack, output: Output, hand: HandConfig, name: str, drawing: _Drawing, wall_minus_mono_ns: int
-) -> DrawingProcess:
+def _draw_on(stack: ExitStack, output: Output, source_of: WatchedSource, drawing: _Drawing) -> DrawingProcess:
     from skinnode.view.drawing_process import DrawingOptions, DrawingProcess
 
-    options = DrawingOptions(drawing.exaggeration, wall_minus_mono_ns, live=True)
-    return stack.enter_context(DrawingProcess(hand, output.target(name), options))
+    options = DrawingOptions(drawing.exaggeration, source_of.wall_minus_mono_ns, live=True)
+    return stack.enter_context(DrawingProcess(source_of.hand, output.target(source_of.name), options))
 
 
 def _show(

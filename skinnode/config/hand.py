@@ -74,6 +74,11 @@ class HandConfig(Table):
         """Return the patches on the bus called ``bus``, in file order."""
         return tuple(patch for patch in self.patches if patch.bus == bus)
 
+    @property
+    def served_buses(self) -> tuple[BusConfig, ...]:
+        """Buses that carry patches, in file order."""
+        return tuple(bus for bus in self.buses if self.patches_on(bus.name))
+
     def where(self, key: str) -> str:
         """Return ``file:line:column`` of a dotted key, for error messages; empty if there is no file."""
         return self._read_of.where(key_path(key))

@@ -1,8 +1,8 @@
 """Configure, start and supervise nodes; receive, assemble, solve and publish their scans.
 
 **Data flow.** The module ``lifecycle`` starts and stops the parts of a host; ``host`` is their public
-interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``served_bus``. Each patch has a
-``patch_stream`` and a ``node_monitor``::
+interface, most of which it shares with remote hands (``running_hand``). Each bus has a ``link`` (port,
+receive queue, reopening) and a ``served_bus``. Each patch has a ``patch_stream`` and a ``node_monitor``::
 
     receive thread -> link (receive queue) -> mainline -> dispatcher (calls the handlers set up in reception)
         -> patch_stream (assembles scans) -> code_watch (selects usable codes) -> workers, scan_solver
@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from skinnode.host.health import Condition, PatchHealth
     from skinnode.host.host import Host, HostStats
     from skinnode.host.publish import Subscription
+    from skinnode.host.running_hand import RunningHand
     from skinnode.host.start import BringUpCancelled
 
 _HOME = {
@@ -78,10 +79,20 @@ _HOME = {
     "Host": "skinnode.host.host",
     "HostStats": "skinnode.host.host",
     "PatchHealth": "skinnode.host.health",
+    "RunningHand": "skinnode.host.running_hand",
     "Subscription": "skinnode.host.publish",
 }
 
-__all__ = ["BringUpCancelled", "Condition", "HandFrame", "Host", "HostStats", "PatchHealth", "Subscription"]
+__all__ = [
+    "BringUpCancelled",
+    "Condition",
+    "HandFrame",
+    "Host",
+    "HostStats",
+    "PatchHealth",
+    "RunningHand",
+    "Subscription",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,25 +11,20 @@ from pathlib import Path
 from skinnode.config import BusConfig, HandConfig, load_hand
 from skinnode.errors import CodecError, NodeError
 from skinnode.host import nmt_master
-from skinnode.host.callback import FieldCallback
 from skinnode.host.configurator import BOOT_DEADLINE_S
 from skinnode.host.containment import DefectStats
 from skinnode.host.dispatcher import BusStats
-from skinnode.host.events import CAPACITY_EVENTS, EventSubscription
-from skinnode.host.hand_frame import HandGatherer, HandSubscription, require_one_sync
 from skinnode.host.health import BusHealth, PatchHealth, faults_of
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.lifecycle import HostParts, StartOptions, never, running_parts
 from skinnode.host.other_masters import OtherMasterStats
 from skinnode.host.patch_stream import StreamStats
-from skinnode.host.publish import Subscription
+from skinnode.host.running_hand import RunningHand
 from skinnode.host.served_bus import ServedBus
-from skinnode.host.skeleton import Skeleton
 from skinnode.host.supervised import NodeStats
 from skinnode.host.sync import SyncStats
 from skinnode.host.tap import ContainedTap, HostTap, tap_bus
 from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS, tare
-from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
 from skinnode.transport import CanPort
@@ -64,7 +59,7 @@ class HostStats:
         return self.other_masters
 
 
-class Host:
+class Host(RunningHand):
     """Host of a running hand, created by the context manager :meth:`from_toml` or :meth:`from_config`.
 
     Example::
@@ -82,10 +77,9 @@ class Host:
     """
 
     def __init__(self, parts: HostParts) -> None:
-        self.hand, self._defects = parts.hand, parts.defects
-        self._callbacks, self._events = parts.callbacks, parts.events
+        super().__init__(parts.hand, parts.publisher, parts.events, parts.callbacks)
+        self._defects, self._sync, self._supervisor = parts.defects, parts.sync, parts.supervisor
         self._buses, self._nodes = parts.buses, parts.nodes
-        self._sync, self._supervisor, self._publisher = parts.sync, parts.supervisor, parts.publisher
         self._t_up_ns = clock.monotonic_ns()
 
     @classmethod
@@ -179,80 +173,6 @@ class Host:
             ):
                 yield host
 
-    def fields(
-        self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
-    ) -> Subscription:
-        """Subscribe to the fields of all scans from now on.
-
-        Iterate over the subscription with ``for`` or ``async for``.
-
-        Args:
-            timeout_s: Maximum time (s) to wait for a field before the iteration raises TimeoutError; None for
-                no limit.
-            capacity: Queue length, in fields; by default, the capacity in the hand file. A full queue drops
-                its oldest field.
-            patch: Name of the patch; all patches by default.
-
-        Raises:
-            ValueError: if there is no such patch, or ``capacity`` or ``timeout_s`` is out of range.
-        """
-        kept = self.hand.stream.capacity_fields if capacity is None else capacity
-        return self._publisher.subscribe(kept, timeout_s, patch)
-
-    def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
-        """Subscribe to hand frames. A hand frame combines the fields of all patches for one SYNC.
-
-        Iterate over the subscription with ``for`` or ``async for``. A hand frame is delivered at most two
-        SYNC periods after its first field. Delivery does not wait for absent patches.
-
-        Args:
-            timeout_s: Maximum time (s) to wait for a hand frame before the iteration raises TimeoutError;
-                None for no limit.
-            capacity: Queue length, in hand frames; by default, the capacity in the hand file.
-
-        Raises:
-            ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.
-        """
-        require_one_sync(self.hand)
-        patches = [patch.name for patch in self.hand.patches]
-        kept = (self.hand.stream.capacity_fields if capacity is None else capacity) * len(patches)
-        patience_ns = 2 * self.hand.sync.period_ms * 1_000_000
-        gatherer = HandGatherer(
-            patches, patience_ns, lambda patch: self.health(patch).condition, Skeleton.of(self.hand)
-        )
-        return HandSubscription(self.fields(capacity=kept), gatherer, timeout_s)
-
-    def on_field(
-        self,
-        function: Callable[[FieldFrame], object],
-        *,
-        patch: str | None = None,
-        capacity: int | None = None,
-    ) -> FieldCallback:
-        """Call ``function`` with each new field, on a separate thread.
-
-        The calls end when the host closes or the callback's ``close()`` is called. A function that blocks or
-        raises an exception does not affect other subscribers. The callback counts the fields that it loses.
-
-        Args:
-            function: Function to call with each field.
-            patch: Name of the patch; all patches by default.
-            capacity: Queue length, in fields; by default, the capacity in the hand file.
-
-        Raises:
-            TypeError: if ``function`` is not callable, or is async.
-            ValueError: if there is no such patch, or ``capacity`` is out of range.
-        """
-        return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
-
-    def latest(self, patch: str) -> FieldFrame | None:
-        """Return a patch's newest field without waiting; None before the first field.
-
-        Raises:
-            ValueError: if there is no such patch.
-        """
-        return self._publisher.latest(patch)
-
     def layout(self, patch: str) -> PatchLayout:
         """Return the electrode layout used to compute a patch's fields.
 
@@ -294,17 +214,6 @@ class Host:
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
         return bool(self.hand.sync.counter_overflow) or not any(each.stats().offered for each in streams)
-
-    def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to touches, and to changes in the health of patches, wires and buses.
-
-        Args:
-            capacity: Queue length, in events. A full queue drops its oldest event.
-
-        Raises:
-            ValueError: if ``capacity`` is below 1.
-        """
-        return self._events.subscribe(capacity)
 
     def _all_health(self) -> dict[str, PatchHealth]:
         return {patch: self.health(patch) for patch in self._nodes}

@@ -42,6 +42,7 @@ HELP: Final = """\
  1 … 9, ← →, tab   select a patch
  z, enter          show that patch alone, or all (also esc)
  t, T              tare that patch, or all patches: the current reading becomes zero
+ n                 reset that patch's node (NMT); the host brings it up again
  r                 start or stop a recording
  space             freeze the display; the host continues
  a                 show or hide shear arrows on the maps
@@ -60,7 +61,7 @@ class MonitorApp(App[None]):
     """Full-screen monitor for a data source.
 
     Args:
-        source: Host or recording; the caller must close it.
+        source: Host, remote hand or recording; the caller must close it.
         folder: Folder for recordings.
         colours: Colours of the terminal.
         over: Function called at each screen update; the monitor ends when it returns True.
@@ -78,6 +79,7 @@ class MonitorApp(App[None]):
         Binding("escape", "unzoom", "back"),
         Binding("t", "tare(False)", "tare"),
         Binding("T", "tare(True)", "tare all"),
+        Binding("n", "reset", "reset the node"),
         Binding("r", "record", "record"),
         Binding("space,p", "pause", "pause"),
         Binding("a", "arrows", "arrows"),
@@ -109,8 +111,8 @@ class MonitorApp(App[None]):
         self._lines: deque[LogLine] = deque(maxlen=_LOG_LINES)
         self._scale = Scale()
         self._view: View | None = None
-        self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Message and severity for each completed tare."""
+        self._done: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
+        """Message and severity for each completed command."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = source.wall_minus_mono_ns
@@ -171,7 +173,7 @@ class MonitorApp(App[None]):
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
             if not begins:  # skip events for patches that become operational at start-up
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
-        self._settle_tares()
+        self._settle_commands()
         if not self._paused:
             self._view = view
             self._scale.update(view.t_ns, view.deepest_m)
@@ -201,7 +203,8 @@ class MonitorApp(App[None]):
             paused=self._paused,
             arrows=self._arrows,
             over=self._source.over,
-            live=self._source.live,
+            commands=self._source.no_commands is None,
+            recordable=self._source.no_recording is None,
             recording=self._source.recording,
             message=message if now_s < until_s else "",
             message_level=level,
@@ -256,43 +259,56 @@ class MonitorApp(App[None]):
     def action_tare(self, everything: bool) -> None:
         """Ask for confirmation, then tare the selected patch or all patches."""
         names = self._names if everything else [self._names[self._selected]]
-        if not self._source.live:
-            self._say("a recording cannot be tared", "bad")
-            return
-        what = "all patches" if everything else names[0]
         felt = [
             f"{name} {1e6 * (self._view.patch(name).depth_m or 0.0):.0f} µm" for name in names if self._view
         ]
-        text = f"Tare {what}?\n\nThe current reading becomes zero: {', '.join(felt)}.\n"
-        text += "Do not touch the skin.\n\n"
+        text = f"Tare {'all patches' if everything else names[0]}?\n\n"
+        text += f"The current reading becomes zero: {', '.join(felt)}.\nDo not touch the skin."
+        done = "tared; the new baseline is in use"
+        self._ask(text, "tare", lambda: self._command(names, "tare", self._source.tare, done))
+
+    def action_reset(self) -> None:
+        """Ask for confirmation, then reset the node of the selected patch."""
+        names, done = [self._names[self._selected]], "reset; the host brings its node up again"
+        text = f"Reset the node of {names[0]}?\n\nUntil the host has brought it up again, it sends no data."
+        self._ask(text, "reset", lambda: self._command(names, "reset", self._source.reset_node, done))
+
+    def _ask(self, text: str, verb: str, act: Callable[[], None]) -> None:
+        """Ask for confirmation, then act; or say why the source accepts no commands."""
+        if (refusal := self._source.no_commands) is not None:
+            self._say(refusal, "bad")
+            return
         self.push_screen(
-            Dialog(text + "y, enter: tare     any other key: cancel", question=True),
-            lambda sure: self._tare(names) if sure else None,
+            Dialog(f"{text}\n\ny, enter: {verb}     any other key: cancel", question=True),
+            lambda sure: act() if sure else None,
         )
 
-    def _tare(self, names: list[str]) -> None:
-        """Tare patches on daemon threads, which do not delay the monitor's exit."""
-        self._say(f"{', '.join(names)}: tare requested")
+    def _command(self, names: list[str], verb: str, act: Callable[[str], None], done: str) -> None:
+        """Command patches on daemon threads, which do not delay the monitor's exit."""
+        self._say(f"{', '.join(names)}: {verb} requested")
 
-        def tare(name: str) -> None:
+        def command(name: str) -> None:
             try:
-                self._source.tare(name)
+                act(name)
             except SkinError as error:
-                self._tares.put((str(error), "bad"))
+                self._done.put((str(error), "bad"))
             else:
-                self._tares.put((f"{name}: tared; the new baseline is in use", "good"))
+                self._done.put((f"{name}: {done}", "good"))
 
         for name in names:
-            threading.Thread(target=tare, args=(name,), name=f"tare {name}", daemon=True).start()
+            threading.Thread(target=command, args=(name,), name=f"{verb} {name}", daemon=True).start()
 
-    def _settle_tares(self) -> None:
-        """Show the results of completed tares."""
-        while not self._tares.empty():
-            self._say(*self._tares.get())
+    def _settle_commands(self) -> None:
+        """Show the results of completed commands."""
+        while not self._done.empty():
+            self._say(*self._done.get())
 
     async def action_record(self) -> None:
         """Start or stop a recording."""
         source = self._source
+        if (refusal := source.no_recording) is not None:
+            self._say(refusal, "bad")
+            return
         try:
             if source.recording is None:
                 path = await asyncio.to_thread(source.record, self._folder)

@@ -15,6 +15,7 @@ from skinnode.monitor import field_map
 from skinnode.monitor.field_map import Line
 from skinnode.monitor.theme import Paint, Theme, beside, centred, pad, spread
 from skinnode.monitor.view_model import PatchView
+from skinnode.text.words import counted
 
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
 """Conditions in which the last displacement field of a patch is out of date."""
@@ -188,8 +189,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
     """Return all values of a patch as lines, each with a name and a value."""
-    health, stream = patch.health, patch.stream
-    counts = stream.assembler
+    health = patch.health
     lines = [
         spread(
             [
@@ -209,33 +209,15 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
 
     for word in patch.words:
         fact("wrong", word, theme.of("bad" if patch.level == "bad" else "note"))
-    if patch.depth_m is not None:
-        std = "" if patch.depth_std_m is None else f" ± {1e6 * patch.depth_std_m:.1f}"
-        fact("deepest", f"{1e6 * patch.depth_m:.1f}{std} µm")
-        fact("shear", shear_text(patch.shear_m) or "none")
-        trust = "trusted" if patch.trusted else "not trusted"
-        precise = "precise" if patch.precise else "not precise"
-        good = patch.trusted and patch.precise
-        fact("field", f"{patch.method}, {trust}, {precise}", theme.text if good else theme.note)
-        if patch.distrust:
-            fact("because", patch.distrust, theme.note)
-        if patch.data_share is not None:
-            fact("data", f"{patch.data_share:.0%} of the depth comes from the data")
+    for name, text, style in _field_facts(patch, theme):
+        fact(name, text, style)
     for fault in patch.data_faults:
         fact("left out", str(fault), theme.note)
     fact("scans", f"{patch.rate_hz:.1f}/s, newest {patch.scan}" if patch.scan is not None else "none yet")
     if patch.latency_s is not None and patch.latency_max_s is not None:
         fact("latency", f"{1e3 * patch.latency_s:.1f} ms, worst {1e3 * patch.latency_max_s:.1f}")
-    lost = {
-        "scans torn": counts.scans_torn,
-        "scans corrupt": counts.scans_corrupt,
-        "scans missed": counts.scans_missed,
-        "scans skipped": stream.skipped,
-        "scans withheld": stream.withheld + stream.partial,
-        "chunks lost": counts.chunks_lost,
-    }
-    losses = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
-    fact("losses", losses or "none", theme.note if losses else theme.good)
+    for name, text, style in _losses(patch, theme):
+        fact(name, text, style)
     state = (
         "unknown" if health.nmt_state is None else STATE_NAMES.get(health.nmt_state, str(health.nmt_state))
     )
@@ -249,6 +231,47 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
     if health.life:
         fact("converter", health.life, theme.note)
     return lines
+
+
+def _field_facts(patch: PatchView, theme: Theme) -> list[tuple[str, str, Style]]:
+    """Return facts about a patch's newest field; none if there is no field."""
+    if patch.depth_m is None:
+        return []
+    std = "" if patch.depth_std_m is None else f" ± {1e6 * patch.depth_std_m:.1f}"
+    trust = "trusted" if patch.trusted else "not trusted"
+    precise = "precise" if patch.precise else "not precise"
+    style = theme.text if patch.trusted and patch.precise else theme.note
+    found = [
+        ("deepest", f"{1e6 * patch.depth_m:.1f}{std} µm", theme.text),
+        ("shear", shear_text(patch.shear_m) or "none", theme.text),
+        ("field", f"{patch.method}, {trust}, {precise}", style),
+    ]
+    if patch.distrust:
+        found.append(("because", patch.distrust, theme.note))
+    if patch.data_share is not None:
+        found.append(("data", f"{patch.data_share:.0%} of the depth comes from the data", theme.text))
+    return found
+
+
+def _losses(patch: PatchView, theme: Theme) -> list[tuple[str, str, Style]]:
+    """Return facts about a patch's losses since the start and, for a remote hand, about the transit."""
+    stream, arrivals = patch.stream, patch.arrivals
+    if stream is None:
+        delay = "" if arrivals.transit_s is None else f", {1e3 * arrivals.transit_s:.1f} ms"
+        transit = f"{counted(arrivals.lost or 0, 'field')} lost{delay}"
+        style = theme.note if arrivals.lost else theme.good
+        return [("transit", transit, style), ("losses", "not available", theme.dim)]
+    counts = stream.assembler
+    lost = {
+        "scans torn": counts.scans_torn,
+        "scans corrupt": counts.scans_corrupt,
+        "scans missed": counts.scans_missed,
+        "scans skipped": stream.skipped,
+        "scans withheld": stream.withheld + stream.partial,
+        "chunks lost": counts.chunks_lost,
+    }
+    losses = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
+    return [("losses", losses or "none", theme.note if losses else theme.good)]
 
 
 def _wrapped(text: str, width: int) -> list[str]:

@@ -63,6 +63,8 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
         left += [Segment("  ", bar), Segment(f" {wrong} {'fault' if wrong == 1 else 'faults'} ", theme.alarm)]
     if ui.paused:
         left += [Segment("  ", bar), Segment(" PAUSED ", theme.alarm)]
+    if view.away is not None:
+        left += [Segment("  ", bar), Segment(" DAEMON AWAY ", theme.alarm)]
     if ui.over:
         left += [Segment("  ", bar), Segment(" END OF RECORDING ", theme.alarm)]
     if ui.recording is not None:
@@ -78,7 +80,8 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 def _losses(view: View, bus: BusView) -> str:
     """Describe the chunks, summaries and scans lost on a bus; empty if there are none."""
-    counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
+    streams = [patch.stream for patch in view.patches if patch.bus == bus.name]
+    counts = [stream.assembler for stream in streams if stream is not None]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
         ("summaries_lost", "summary lost", "summaries lost"),
@@ -92,20 +95,13 @@ def _losses(view: View, bus: BusView) -> str:
 
 
 def _bus_line(bus: BusView, losses: str, theme: Theme, width: int) -> Line:
-    cells = 12 if width < 110 else 24
-    full = min(cells, round(bus.load * cells))
     words = [*bus.words, losses] if losses else list(bus.words)
     style = theme.note if losses and bus.level == "good" else theme.of(bus.level)
-    load = theme.bad if bus.load > 0.9 else theme.note if bus.load > 0.7 else theme.gauge
+    well = "no fault reported" if bus.frames_hz is None else "nothing lost"
     line = [
         Segment(f" {bus.name:<6.12}", theme.strong),
-        Segment("load ", theme.dim),
-        Segment("█" * full, load),
-        Segment("·" * (cells - full), theme.dim),
-        Segment(f"{100 * bus.load:4.0f} %  ", theme.text),
-        Segment(f"{bus.frames_hz:5.0f}", theme.text),
-        Segment(" frames/s  ", theme.dim),
-        Segment("; ".join(words) or "nothing lost", style),
+        *_load_and_rate(bus, theme, 12 if width < 110 else 24),
+        Segment("; ".join(words) or well, style),
     ]
     where = [Segment(f"  {bus.where} ({bus.role}) ", theme.dim)]
     if width_of(line) + width_of(where) > width:
@@ -113,13 +109,31 @@ def _bus_line(bus: BusView, losses: str, theme: Theme, width: int) -> Line:
     return spread(line, where, width, theme)
 
 
+def _load_and_rate(bus: BusView, theme: Theme, cells: int) -> Line:
+    if bus.load is None:
+        return [Segment("load and frames/s not available  ", theme.dim)]
+    full = min(cells, round(bus.load * cells))
+    style = theme.bad if bus.load > 0.9 else theme.note if bus.load > 0.7 else theme.gauge
+    line = [
+        Segment("load ", theme.dim),
+        Segment("█" * full, style),
+        Segment("·" * (cells - full), theme.dim),
+        Segment(f"{100 * bus.load:4.0f} %  ", theme.text),
+    ]
+    if bus.frames_hz is None:
+        return [*line, Segment("frames/s not available  ", theme.dim)]
+    return [*line, Segment(f"{bus.frames_hz:5.0f}", theme.text), Segment(" frames/s  ", theme.dim)]
+
+
 def _keys(ui: UiState, theme: Theme, width: int) -> Line:
     if ui.message:
         style = theme.alarm if ui.message_level == "bad" else theme.key
         return pad([Segment(f" {ui.message} ", style)], width, theme, theme.bar)
     keys = [("1-9", "patch"), ("z", "back" if ui.zoomed else "zoom")]
-    if ui.live:
-        keys += [("t", "tare"), ("r", "stop recording" if ui.recording else "record")]
+    if ui.commands:
+        keys += [("t", "tare"), *([("n", "reset")] if width >= 100 else [])]
+    if ui.recordable:
+        keys += [("r", "stop recording" if ui.recording else "record")]
     keys += [("space", "continue" if ui.paused else "pause"), ("a", "arrows"), ("?", "help"), ("q", "quit")]
     line = [Segment(" ", theme.bar)]
     for key, what in keys:
@@ -173,8 +187,8 @@ def _touches(patches: Sequence[PatchView], scale: Line, theme: Theme, width: int
         pad(_touch_line(patch, touch, theme, name), width, theme) for patch, touch in rows[: height - 1]
     ]
     if not rows:
-        known = any(patch.depth_m is not None for patch in patches)
-        lines.append([Segment(" nothing touches" if known else " nothing known yet", theme.dim)])
+        known = any(patch.depth_m is not None and patch.condition not in GONE for patch in patches)
+        lines.append([Segment(" nothing touches" if known else " nothing known", theme.dim)])
     return [*lines, *([[]] * (height - len(lines)))]
 
 
@@ -202,8 +216,9 @@ def _quiet(view: View) -> str:
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:
         return f" no events yet; earlier faults: {', '.join(wrong)}"
+    known = all(patch.stream is not None for patch in view.patches)
     lost = any(_losses(view, bus) for bus in view.buses)
-    return " no event" if lost else " nothing happened"
+    return " nothing happened" if known and not lost else " no event"
 
 
 def _log(log: Sequence[LogLine], quiet: str, theme: Theme, width: int, height: int) -> list[Line]:

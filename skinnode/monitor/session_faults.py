@@ -9,10 +9,12 @@ from typing import Any, Final
 
 from skinnode.host.accounting import losses_of_stream
 from skinnode.host.health import Condition, PatchHealth
+from skinnode.host.patch_stream import StreamStats
 from skinnode.host.trust_report import fault_table
 from skinnode.monitor.source import Source
 from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
+from skinnode.text.words import counted
 
 SETTLE_NS: Final = 3_000_000_000
 """Time (ns) within which all patches of a running hand must become operational."""
@@ -60,10 +62,8 @@ class FaultBook:
                 self._settled.add(patch.name)
             elif patch.name in self._settled or not patient:
                 self._add(patch.name, patch.condition, patch.condition)
-            for key, text in _lasting(patch.health):
+            for key, text in (*_lasting(patch.health), *_losses(patch)):
                 self._add(patch.name, key, text)
-            for counter, text in losses_of_stream(patch.stream).items():
-                self._add(patch.name, counter, text)
         for bus in view.buses:
             if bus.level == "bad":
                 for word in bus.words:
@@ -85,13 +85,22 @@ def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
     return found
 
 
+def _losses(patch: PatchView) -> list[tuple[str, str]]:
+    """Return (counter, text) pairs for the nonzero loss counters of a patch."""
+    found = [] if patch.stream is None else list(losses_of_stream(patch.stream).items())
+    if patch.arrivals.lost:
+        lost = counted(patch.arrivals.lost, "field lost", "fields lost")
+        found.append(("fields", f"{lost} between its daemon and this process"))
+    return found
+
+
 def watch(
     source: Source, stop: threading.Event, seconds: float | None, faults: FaultBook
 ) -> Iterator[dict[str, Any]]:
     """Yield the current view as a JSON object every second, and once more at the end.
 
     Args:
-        source: Host or recording.
+        source: Host, remote hand or recording.
         stop: Event that ends the iteration.
         seconds: Maximum duration; None for no limit.
         faults: Faults of the session, updated at each check.
@@ -117,15 +126,15 @@ def watch(
 
 
 def as_json(view: View) -> dict[str, Any]:
-    """Return the view as JSON-compatible data; the displacement fields are omitted."""
+    """Return the view as JSON-compatible data, with None for unavailable values and no displacements."""
     return {
         "patches": {patch.name: _patch_json(patch) for patch in view.patches},
         "buses": {
             bus.name: {
                 "level": bus.level,
                 "words": list(bus.words),
-                "load": round(bus.load, 4),
-                "frames_hz": round(bus.frames_hz, 1),
+                "load": None if bus.load is None else round(bus.load, 4),
+                "frames_hz": None if bus.frames_hz is None else round(bus.frames_hz, 1),
                 "lost": bus.lost,
             }
             for bus in view.buses
@@ -133,11 +142,11 @@ def as_json(view: View) -> dict[str, Any]:
         "fields_hz": round(view.fields_hz, 2),
         "latency_s": view.latency_s,
         "latency_max_s": view.latency_max_s,
+        "away": view.away,
     }
 
 
 def _patch_json(patch: PatchView) -> dict[str, Any]:
-    counts = patch.stream.assembler
     return {
         "node_id": patch.node_id,
         "bus": patch.bus,
@@ -159,15 +168,27 @@ def _patch_json(patch: PatchView) -> dict[str, Any]:
         "precise": patch.precise,
         "deepest_data_share": patch.data_share,
         "data_faults": [fault_table(fault) for fault in patch.data_faults],
-        "torn": counts.scans_torn,
-        "corrupt": counts.scans_corrupt,
-        "missed": counts.scans_missed,
-        "skipped": patch.stream.skipped,
-        "chunks_lost": counts.chunks_lost,
+        **_losses_json(patch.stream),
+        "fields_lost": patch.arrivals.lost,
+        "transit_s": patch.arrivals.transit_s,
         "depth_m": patch.depth_m,
         "depth_std_m": patch.depth_std_m,
         "shear_m": list(patch.shear_m),
         "touches": [_touch_json(touch) for touch in patch.touches],
+    }
+
+
+def _losses_json(stream: StreamStats | None) -> dict[str, int | None]:
+    """Return the loss counters of a patch; None if they are not available."""
+    if stream is None:
+        return dict.fromkeys(("torn", "corrupt", "missed", "skipped", "chunks_lost"))
+    counts = stream.assembler
+    return {
+        "torn": counts.scans_torn,
+        "corrupt": counts.scans_corrupt,
+        "missed": counts.scans_missed,
+        "skipped": stream.skipped,
+        "chunks_lost": counts.chunks_lost,
     }
 
 

@@ -91,7 +91,9 @@ class UiState:
     arrows: bool = True
     over: bool = False
     """Whether the recording has ended."""
-    live: bool = True
+    commands: bool = True
+    """Whether patches can be tared and reset."""
+    recordable: bool = True
     recording: Recording | None = None
     message: str = ""
     message_level: Level = "good"

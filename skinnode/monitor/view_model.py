@@ -12,18 +12,17 @@ from typing import Final, Literal
 import numpy as np
 
 from skinnode.canopen.emergency import register_text
-from skinnode.config import HandConfig, PatchConfig
+from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.config.patches import LayoutConfig
-from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import HealthEvent
-from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.health import Condition, PatchHealth
 from skinnode.host.patch_stream import StreamStats
 from skinnode.host.trust_report import deepest_data_share
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.distrust_text import why_not
 from skinnode.model.layout import Float
 from skinnode.monitor.field_map import Surface, mean_shear_m, surface_of
-from skinnode.monitor.source import Snapshot
+from skinnode.monitor.source import Arrivals, Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
@@ -44,7 +43,9 @@ class PatchView:
     words: tuple[str, ...]
     """Descriptions of the patch's faults, most severe first."""
     health: PatchHealth
-    stream: StreamStats
+    stream: StreamStats | None
+    """Counters of the patch; None for a remote hand, whose daemon does not send them."""
+    arrivals: Arrivals
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
@@ -78,9 +79,11 @@ class BusView:
     role: str
     level: Level
     words: tuple[str, ...]
-    load: float
-    """Bus load over the last second, as a fraction of the bus capacity."""
-    frames_hz: float
+    load: float | None
+    """Bus load over the last second, as a fraction of the bus capacity; None if the daemon of a remote hand
+    is away."""
+    frames_hz: float | None
+    """Frames per second; None for a remote hand, whose daemon does not send the number."""
     lost: int
     """Number of frames dropped by the kernel or the host."""
 
@@ -98,6 +101,8 @@ class View:
     """Fields per second, summed over all patches."""
     latency_s: float | None
     latency_max_s: float | None
+    away: str | None = None
+    """Reason why no data arrive from the daemon of a remote hand; None while they arrive."""
 
     @property
     def deepest_m(self) -> float:
@@ -150,11 +155,7 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
     patches = tuple(_patch_view(patch, history, elapsed_s, live) for patch in hand.patches)
-    buses = tuple(
-        _bus_view(hand, now.bus_health[bus.name], now.buses[bus.name], before.buses[bus.name], elapsed_s)
-        for bus in hand.buses
-        if bus.name in now.buses
-    )
+    buses = tuple(_bus_view(bus, now, before, elapsed_s) for bus in hand.buses if bus.name in now.bus_health)
     slowest = [patch.latency_max_s for patch in patches if patch.latency_max_s is not None]
     medians = [patch.latency_s for patch in patches if patch.latency_s is not None]
     return View(
@@ -165,13 +166,16 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
         fields_hz=sum(patch.rate_hz for patch in patches),
         latency_s=statistics.median(medians) if medians else None,
         latency_max_s=max(slowest, default=None),
+        away=now.away,
     )
 
 
 def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float, live: bool) -> PatchView:
     now, before, name = history[-1], history[0], patch.name
-    health, stream, field = now.health[name], now.streams[name], now.fields[name]
-    condition, level, words = judge_patch(health, stream, before.streams[name])
+    health, field, arrivals = now.health[name], now.fields[name], now.arrivals[name]
+    condition, level, words = judge_patch(health, _recent_losses(name, now, before))
+    if now.away is not None:
+        words = ("daemon away",)  # the other words describe the past
     surface = None if field is None else surface_of(field, upper_m(patch.layout))
     depth_m = depth_std_m = None
     if field is not None and surface is not None:
@@ -188,8 +192,9 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
         level=level,
         words=words,
         health=health,
-        stream=stream,
-        rate_hz=max(0, stream.solved - before.streams[name].solved) / elapsed_s,
+        stream=now.streams.get(name),
+        arrivals=arrivals,
+        rate_hz=max(0, arrivals.received - before.arrivals[name].received) / elapsed_s,
         latency_s=statistics.median(latencies) if latencies else None,
         latency_max_s=max(latencies, default=None),
         scan=None if field is None or field.stamp is None else field.stamp.scan,
@@ -228,17 +233,27 @@ def upper_m(layout: LayoutConfig) -> Float:
     return layout.build().upper_m
 
 
-def judge_patch(
-    health: PatchHealth, stream: StreamStats, before: StreamStats
-) -> tuple[str, Level, tuple[str, ...]]:
-    """Return the condition of a patch, its severity, and descriptions of its faults."""
+def _recent_losses(name: str, now: Snapshot, before: Snapshot) -> list[str]:
+    """Return a description of each kind of loss of a patch between two snapshots."""
+    counts = [("fields", (now.arrivals[name].lost or 0) - (before.arrivals[name].lost or 0))]
+    if name in now.streams:
+        after, first = now.streams[name].assembler, before.streams[name].assembler
+        counts.append(("chunks", after.chunks_lost - first.chunks_lost))
+        counts.append(("scans", after.scans_missed - first.scans_missed))
+    return [f"{count} {what} lost" for what, count in counts if count > 0]
+
+
+def judge_patch(health: PatchHealth, lossy: Sequence[str]) -> tuple[str, Level, tuple[str, ...]]:
+    """Return the condition of a patch, its severity, and descriptions of its faults.
+
+    Args:
+        health: Health of the patch.
+        lossy: Descriptions of its recent losses.
+    """
     condition = health.condition
-    if condition is Condition.STALE and not stream.solved and not stream.withheld:
+    if condition is Condition.STALE and health.scan_age_s is None:
         return "starting", "note", ()
     words = _faults(health)
-    losses = stream.assembler.chunks_lost - before.assembler.chunks_lost
-    missed = stream.assembler.scans_missed - before.assembler.scans_missed
-    lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
         lossy = []  # the condition already explains these losses
     level: Level = "good"
@@ -272,10 +287,11 @@ def _faults(health: PatchHealth) -> list[str]:
     return words
 
 
-def _bus_view(
-    hand: HandConfig, health: BusHealth, stats: BusStats, before: BusStats, elapsed_s: float
-) -> BusView:
-    bus = hand.bus(health.bus)
+def _bus_view(bus: BusConfig, now: Snapshot, before: Snapshot, elapsed_s: float) -> BusView:
+    health, frames_hz = now.bus_health[bus.name], None
+    if bus.name in now.buses:
+        stats, first = now.buses[bus.name], before.buses[bus.name]
+        frames_hz = max(0, stats.received + stats.sent - first.received - first.sent) / elapsed_s
     words = []
     if health.away is not None:
         words.append(f"away: {health.away}")
@@ -301,15 +317,14 @@ def _bus_view(
             f"{health.foreign} foreign frames ({shown}{' …' if len(health.foreign_ids) > 3 else ''})"
         )
         level = "note" if level == "good" else level
-    frames = stats.received + stats.sent - before.received - before.sent
     return BusView(
         name=health.bus,
         where=f"{bus.interface} {bus.channel}",
         role=bus.role,
         level=level,
         words=tuple(words),
-        load=health.load,
-        frames_hz=max(0, frames) / elapsed_s,
+        load=None if now.away else health.load,
+        frames_hz=frames_hz,
         lost=lost,
     )
 

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Iterator
 from typing import Final
 
-from skinnode.config import BusConfig
 from skinnode.host import Host
 from skinnode.host.events import EventSubscription
 from skinnode.process import clock
@@ -62,14 +61,9 @@ def _watch(recorder: Recorder, host: Host, events: EventSubscription, over: thre
             due_s = now_s + HEALTH_S
             recorder.health(
                 {patch.name: host.health(patch.name) for patch in host.hand.patches},
-                {bus.name: host.bus_health(bus.name) for bus in _served(host)},
+                {bus.name: host.bus_health(bus.name) for bus in host.hand.served_buses},
             )
         timeout_s = 0.0 if ended else min(_POLL_S, max(0.0, due_s - clock.monotonic()))
         while (event := events.get(timeout_s)) is not None:
             recorder.event(event)
             timeout_s = 0.0
-
-
-def _served(host: Host) -> list[BusConfig]:
-    """Return the buses that carry patches."""
-    return [bus for bus in host.hand.buses if host.hand.patches_on(bus.name)]

@@ -55,16 +55,17 @@ def connect(
     options = SessionOptions(router, None, None if config is None else Path(config), port)
     end_s = None if timeout_s is None else clock.monotonic() + timeout_s
     session = open_program(options, end_s)
+    closing: RemoteHand | zenoh.Session = session
     try:
-        remote = RemoteHand(session, _described(session, hand, end_s, options))
+        closing = remote = RemoteHand(session, _described(session, hand, end_s, options))
+        while not remote.ready:
+            if _over(end_s):
+                why = f"its daemon sent no health within {timeout_s:g} s; connect again"
+                raise SkinError(f"hand {hand!r}: {why}")
+            clock.sleep(_POLL_S)
     except BaseException:
-        session.close()
+        closing.close()
         raise
-    while not remote.ready:
-        if _over(end_s):
-            remote.close()
-            raise SkinError(f"hand {hand!r}: its daemon sent no health within {timeout_s:g} s; connect again")
-        clock.sleep(_POLL_S)
     return remote
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import SkinError
-from skinnode.host.callback import Callbacks, FieldCallback
+from skinnode.host.callback import Callbacks
 from skinnode.host.containment import Defects
-from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthEvent
-from skinnode.host.hand_frame import HandGatherer, HandSubscription, require_one_sync
+from skinnode.host.events import Events, HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
-from skinnode.host.publish import Publisher, Subscription
-from skinnode.host.skeleton import Skeleton
+from skinnode.host.publish import Publisher
+from skinnode.host.running_hand import RunningHand
 from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS
 from skinnode.messages.full_field import SendStamp
 from skinnode.messages.health_report import HealthReport
@@ -51,7 +50,7 @@ class RemoteStats:
     """Number of messages that could not be decoded, plus the number of other exceptions."""
 
 
-class RemoteHand(Closing):
+class RemoteHand(RunningHand, Closing):
     """Hand that a daemon (``skinnode host --publish``) publishes; :func:`skinnode.connect` creates it.
 
     If the daemon ends or the connection fails, subscriptions wait, :meth:`health` reports every patch as lost
@@ -65,12 +64,11 @@ class RemoteHand(Closing):
     """
 
     def __init__(self, session: zenoh.Session, description: Description) -> None:
-        self.hand = description.hand
+        hand = description.hand
+        names = tuple(patch.name for patch in hand.patches)
+        self._defects = defects = Defects(f"hand {hand.name!r}")
+        super().__init__(hand, Publisher(names, defects), Events(defects), Callbacks(defects))
         self._session, self._description = session, description
-        names = tuple(patch.name for patch in self.hand.patches)
-        self._defects = Defects(f"hand {self.hand.name!r}")
-        self._publisher = Publisher(names, self._defects)
-        self._events, self._callbacks = Events(self._defects), Callbacks(self._defects)
         self._accounts = {name: PatchAccount() for name in names}
         self._report: HealthReport | None = None
         self._t_report_ns = clock.monotonic_ns()
@@ -81,57 +79,6 @@ class RemoteHand(Closing):
         self._receiver = Receiver(session, description, recipients, self._defects)
 
     # --- the same interface as a host
-
-    def fields(
-        self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
-    ) -> Subscription:
-        """Subscribe to the fields of all scans from now on; see :meth:`skinnode.Host.fields`.
-
-        Raises:
-            ValueError: if there is no such patch, or ``capacity`` or ``timeout_s`` is out of range.
-        """
-        kept = self.hand.stream.capacity_fields if capacity is None else capacity
-        return self._publisher.subscribe(kept, timeout_s, patch)
-
-    def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
-        """Subscribe to hand frames; see :meth:`skinnode.Host.hands`.
-
-        Raises:
-            ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.
-        """
-        require_one_sync(self.hand)
-        patches = [patch.name for patch in self.hand.patches]
-        kept = (self.hand.stream.capacity_fields if capacity is None else capacity) * len(patches)
-        patience_ns = 2 * self.hand.sync.period_ms * 1_000_000
-        gatherer = HandGatherer(
-            patches, patience_ns, lambda patch: self.health(patch).condition, Skeleton.of(self.hand)
-        )
-        return HandSubscription(self.fields(capacity=kept), gatherer, timeout_s)
-
-    def on_field(
-        self,
-        function: Callable[[FieldFrame], object],
-        *,
-        patch: str | None = None,
-        capacity: int | None = None,
-    ) -> FieldCallback:
-        """Call ``function`` with each new field, on a separate thread; see :meth:`skinnode.Host.on_field`.
-
-        Raises:
-            TypeError: if ``function`` is not callable or is async.
-            ValueError: if there is no such patch, or ``capacity`` is out of range.
-        """
-        return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
-
-    def latest(self, patch: str) -> FieldFrame | None:
-        """Return a patch's newest field without waiting; None before the first field.
-
-        ``stats().patches[patch].age_s`` gives the age of the field.
-
-        Raises:
-            ValueError: if there is no such patch.
-        """
-        return self._publisher.latest(patch)
 
     def layout(self, patch: str) -> PatchLayout:
         """Return the electrode layout used to compute a patch's fields.
@@ -167,17 +114,6 @@ class RemoteHand(Closing):
         report, away = self._report, self.away
         assert report is not None
         return report.buses[bus] if away is None else replace(report.buses[bus], away=away)
-
-    def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to the host's events and to its daemon's ``away`` and ``back`` events.
-
-        Args:
-            capacity: Queue length, in events. A full queue drops its oldest event.
-
-        Raises:
-            ValueError: if ``capacity`` is below 1.
-        """
-        return self._events.subscribe(capacity)
 
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
         """Tare a patch; see :meth:`skinnode.Host.tare`.
@@ -216,6 +152,14 @@ class RemoteHand(Closing):
         return None
 
     @property
+    def no_commands(self) -> str | None:
+        """Reason why the daemon does not accept commands; None if it accepts them."""
+        if self._description.commands:
+            return None
+        what = "its daemon does not accept commands; start it with skinnode host --publish --commands"
+        return f"hand {self.hand.name!r}: {what}"
+
+    @property
     def ready(self) -> bool:
         """Whether the first health report has arrived."""
         return self._report is not None
@@ -243,13 +187,10 @@ class RemoteHand(Closing):
         patch = str(request["patch"])
         if patch not in self._accounts:
             raise KeyError(patch)
-        name = self.hand.name
-        if not self._description.commands:
-            what = "its daemon does not accept commands; start it with skinnode host --publish --commands"
-            raise SkinError(f"hand {name!r}: {what}")
-        if (away := self.away) is not None:
-            raise SkinError(away)
-        commands.send(self._session, name, request, deadline_s)
+        for refusal in (self.no_commands, self.away):
+            if refusal is not None:
+                raise SkinError(refusal)
+        commands.send(self._session, self.hand.name, request, deadline_s)
 
     # --- the receiver's thread
 
@@ -260,7 +201,7 @@ class RemoteHand(Closing):
             self._publisher.publish(field, stamp.patch)
 
     def _on_report(self, report: HealthReport) -> None:
-        buses = {bus.name for bus in self.hand.buses if self.hand.patches_on(bus.name)}
+        buses = {bus.name for bus in self.hand.served_buses}
         if set(report.patches) != set(self._accounts) or set(report.buses) != buses:
             raise ValueError("a health report for another hand")
         self._report, self._t_report_ns = report, clock.monotonic_ns()

@@ -70,7 +70,7 @@ class SessionOptions:
             if endpoint is not None:
                 host_of(option, endpoint)
         if not 1024 <= self.port <= 65536 - PORTS:
-            raise ConfigError("--port", self.port, f"an integer from 1024 to {65536 - PORTS}")
+            raise ConfigError("--zenoh-port", self.port, f"an integer from 1024 to {65536 - PORTS}")
 
     @property
     def exposed(self) -> str | None:
@@ -154,7 +154,9 @@ def open_daemon(options: SessionOptions) -> zenoh.Session:
         _settle(session, options, port)
         return session
     last = options.port + PORTS - 1
-    raise ConfigError("--port", options.port, f"a free port from {options.port} to {last} (all are {taken})")
+    raise ConfigError(
+        "--zenoh-port", options.port, f"a free port from {options.port} to {last} (all are {taken})"
+    )
 
 
 def open_program(options: SessionOptions, end_s: float | None) -> zenoh.Session:

@@ -95,8 +95,7 @@ class StatusPublication:
         outputs, host = self._outputs, self._host
         outputs.look()
         patches = {patch.name: host.health(patch.name) for patch in host.hand.patches}
-        served = [bus.name for bus in host.hand.buses if host.hand.patches_on(bus.name)]
-        buses = {name: host.bus_health(name) for name in served}
+        buses = {bus.name: host.bus_health(bus.name) for bus in host.hand.served_buses}
         counters = self._counters()
         report = HealthReport(self._started_ns, patches, buses, counters.published, counters.dropped)
         outputs.health.send(encode_report(report, now_ns), now_ns)

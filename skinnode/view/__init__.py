@@ -1,4 +1,4 @@
-"""Three-dimensional view of a running host or a recording: ``skinnode view``.
+"""Three-dimensional view of a running hand or a recording: ``skinnode view``.
 
 Data flows in one direction::
 

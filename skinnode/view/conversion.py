@@ -14,8 +14,9 @@ from skinnode.config import HandConfig
 from skinnode.host.events import Events
 from skinnode.host.health_watch import HealthWatch
 from skinnode.model.frames import FieldFrame
+from skinnode.monitor.replay_source import bus_health_in, health_in, snapshot_of
 from skinnode.monitor.session_faults import FaultBook
-from skinnode.monitor.source import bus_health_in, drain, health_in, snapshot_of
+from skinnode.monitor.source import drain
 from skinnode.monitor.view_model import History
 from skinnode.record import Replay, replay
 from skinnode.view.drawing_thread import RATE_HZ, STATE_S

@@ -224,7 +224,7 @@ class HandDrawing:
             if conditions[name] in GONE and name not in self._stale and name not in tick.fields:
                 self._stale.add(name)
                 self._draw(name, stale_picture_of(self._rest_m[name]))
-        loads = {bus.name: 100 * bus.load for bus in view.buses}
+        loads = {bus.name: 100 * bus.load for bus in view.buses if bus.load is not None}
         log = self._stream.log
         log(window.LOAD, rr.Scalars([loads.get(bus.name, math.nan) for bus in self._hand.buses]))
         log(window.HEALTH, _markdown(health_text(view, tick.counts, self._notes())))

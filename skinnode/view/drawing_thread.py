@@ -32,7 +32,7 @@ class DrawingThread(Closing):
     """Thread that draws the fields of a source, from construction until :meth:`close`.
 
     Args:
-        source: Host or recording; the caller closes it.
+        source: Host, remote hand or recording; the caller closes it.
         draw: Function that draws the new data; called in this thread.
         rate_hz: Maximum number of fields drawn per patch per second.
     """

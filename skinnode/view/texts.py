@@ -14,6 +14,7 @@ from skinnode.model.layout import Float
 from skinnode.monitor.view_model import View
 
 _MARKS: Final = {"good": "✔", "note": "●", "bad": "✖"}
+_NONE: Final = "not available"
 _MARKDOWN: Final = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]<>()#+!|~"} | {"\n": " "})
 
 
@@ -34,6 +35,8 @@ def contacts_text(frame: HandFrame) -> str:
     Args:
         frame: Newest fields of all patches.
     """
+    if not frame.fields:
+        return "No patch has a current field."
     wrenches = [*frame.wrenches.values(), frame.wrench]
     names = [*frame.wrenches, "whole hand"]
     one = len(frame.wrenches) == 1  # the wrench of a single link is the hand's in another coordinate frame
@@ -86,8 +89,8 @@ def health_text(view: View, counts: DrawnCounts, notes: Iterable[str] = ()) -> s
         (
             f"{_MARKS[bus.level]} {_plain(bus.name)}",
             _plain("; ".join(bus.words) or "no faults"),
-            f"{bus.frames_hz:.0f} /s",
-            f"{100 * bus.load:.0f} %",
+            _NONE if bus.frames_hz is None else f"{bus.frames_hz:.0f} /s",
+            _NONE if bus.load is None else f"{100 * bus.load:.0f} %",
         )
         for bus in view.buses
     ]

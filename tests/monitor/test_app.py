@@ -13,7 +13,7 @@ from textual.pilot import Pilot
 from skinnode.errors import SkinError
 from skinnode.host import Host
 from skinnode.monitor.app import MonitorApp
-from skinnode.monitor.source import HostSource
+from skinnode.monitor.live_source import HostSource
 from skinnode.monitor.widgets import Dialog
 from skinnode.record import replay
 from vcan_sim.faults import Faults

@@ -88,7 +88,10 @@ def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["--simulate"], "standard input and output: got no terminal, allowed: a terminal, or --json"),
-        (["--json"], "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate and --replay RECORDING"),
+        (
+            ["--json"],
+            "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate, --replay",
+        ),
         (["--json", "--simulate", "-o", "/dev/null"], "--output: got '/dev/null', allowed: a folder"),
         (["--json", "--simulate", "-o", ""], "--output: got '', allowed: a folder"),
         (["--json", "/nowhere.toml"], "nowhere.toml"),

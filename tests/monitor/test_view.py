@@ -19,9 +19,10 @@ from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
 from skinnode.monitor import field_map
 from skinnode.monitor.field_map import Colours, MapStyle, Scale, aspect_of, paint_map, paint_shear, surface_of
+from skinnode.monitor.live_source import HostSource
+from skinnode.monitor.replay_source import ReplaySource
 from skinnode.monitor.screen import screen
 from skinnode.monitor.session_faults import FaultBook, as_json
-from skinnode.monitor.source import HostSource, ReplaySource
 from skinnode.monitor.theme import Paint, UiState, theme_for
 from skinnode.monitor.view_model import History, PatchView, View
 from skinnode.record import Recorder, replay

@@ -64,7 +64,7 @@ def test_a_program_uses_the_hand_of_the_command(
 
     program = threading.Thread(target=use)
     program.start()
-    options = ["--publish", "--commands", "--port", str(port), "--seconds", "5"]
+    options = ["--publish", "--commands", "--zenoh-port", str(port), "--seconds", "5"]
     with Fleet(load_hand(hand_file)), pytest.raises(SystemExit) as ended:
         main(["host", str(hand_file), *options])
     program.join(60.0)
@@ -78,7 +78,7 @@ def test_a_second_daemon_is_refused_before_it_opens_a_bus(
     start: Callable[..., Process], hand_file: Path, port: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     start(name="right hand").wait_until_up()
-    status, text = said([str(hand_file), "--publish", "--port", str(port)], capsys)
+    status, text = said([str(hand_file), "--publish", "--zenoh-port", str(port)], capsys)
     assert status == 2
     assert f"{hand_file}:2:" in text
     assert "name: got 'right hand', allowed: a hand that no other daemon publishes" in text
@@ -90,8 +90,8 @@ def test_a_second_daemon_is_refused_before_it_opens_a_bus(
     [
         (["--commands"], "--commands: got it, allowed: only with --publish"),
         (["--router", "tcp/robot:7447"], "--router: got 'tcp/robot:7447', allowed: only with --publish"),
-        (["--port", "9000"], "--port: got 9000, allowed: only with --publish"),
-        (["--publish", "--port", "80"], "--port: got 80, allowed: an integer from 1024 to 65520"),
+        (["--zenoh-port", "9000"], "--zenoh-port: got 9000, allowed: only with --publish"),
+        (["--publish", "--zenoh-port", "80"], "--zenoh-port: got 80, allowed: an integer from 1024 to 65520"),
         (["--publish", "--listen", "robot"], "--listen: got 'robot', allowed: an endpoint such as tcp/"),
         (["--publish", "--commands", "--listen", "tcp/0.0.0.0:7447"], "--commands: got tcp/0.0.0.0:7447"),
         (
@@ -107,8 +107,8 @@ def test_a_second_daemon_is_refused_before_it_opens_a_bus(
 def test_a_wrong_option_is_one_line(
     hand_file: Path, port: int, options: list[str], line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if options[0] == "--publish" and "--port" not in options:
-        options = [*options, "--port", str(port)]
+    if options[0] == "--publish" and "--zenoh-port" not in options:
+        options = [*options, "--zenoh-port", str(port)]
     status, text = said([str(hand_file), *options], capsys)
     assert (status, text.count("\n")) == (2, 1)
     assert line in text
@@ -116,14 +116,14 @@ def test_a_wrong_option_is_one_line(
 
 def test_ports_in_use_are_one_line(hand_file: Path, port: int, capsys: pytest.CaptureFixture[str]) -> None:
     taken = [socket.create_server(("127.0.0.1", port + i)) for i in range(16)]
-    status, text = said([str(hand_file), "--publish", "--port", str(port)], capsys)
+    status, text = said([str(hand_file), "--publish", "--zenoh-port", str(port)], capsys)
     for each in taken:
         each.close()
     assert (status, text.count("\n")) == (2, 1)
-    assert f"--port: got {port}, allowed: a free port from {port} to {port + 15}" in text
+    assert f"--zenoh-port: got {port}, allowed: a free port from {port} to {port + 15}" in text
     with socket.create_server(("127.0.0.1", port)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
-        free = [str(hand_file), "--publish", "--port", str(port), "--listen", endpoint]
+        free = [str(hand_file), "--publish", "--zenoh-port", str(port), "--listen", endpoint]
         status, text = said(free, capsys)
     assert (status, text.count("\n")) == (2, 1)
     assert f"--listen: got '{endpoint}', allowed: a free endpoint" in text

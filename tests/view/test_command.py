@@ -28,7 +28,10 @@ def run(*arguments: str, code: str = PROGRAM, **variables: str) -> subprocess.Co
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate and --replay RECORDING"),
+        (
+            [],
+            "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate, --replay",
+        ),
         (["--simulate", "--replay", "x.log"], "HAND.toml: got both it and --replay"),
         (["--simulate"], "display: got none, allowed: a graphical session, or --web, or --save FILE.rrd"),
         (["/nowhere.toml", "--web"], "nowhere.toml"),

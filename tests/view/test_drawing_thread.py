@@ -10,7 +10,7 @@ import pytest
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.host import Host, Subscription
-from skinnode.monitor.source import HostSource
+from skinnode.monitor.live_source import HostSource
 from skinnode.process import clock
 from skinnode.view.drawing_thread import STATE_S, DrawingThread
 from skinnode.view.tick import Tick

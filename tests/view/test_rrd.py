@@ -14,7 +14,7 @@ import pytest
 from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.frames import FieldFrame
-from skinnode.monitor.source import HostSource
+from skinnode.monitor.live_source import HostSource
 from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.view.conversion import Conversion

@@ -140,8 +140,10 @@ def find_node(
 def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     """Return the bus and node-ID of a node.
 
+    The name of a patch takes precedence, because a name that is a number is not always the patch's node-ID.
+
     Args:
-        node: A node-ID or the name of a patch.
+        node: The name of a patch or a node-ID.
         places: Buses to search.
         key: Name of the command-line argument that contains the node, for error messages.
 
@@ -151,12 +153,12 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     from skinnode.errors import ConfigError
 
     named = [(place, patch) for place in places for patch in place.patches]
+    for place, patch in named:
+        if patch.name == node:
+            return place, patch.node_id
     try:
         node_id = int(node, 0)
     except ValueError:
-        for place, patch in named:
-            if patch.name == node:
-                return place, patch.node_id
         known = f", or {', '.join(patch.name for _, patch in named)}" if named else ""
         raise ConfigError(key, node, f"a node-ID from 1 to 127{known}") from None
     if not 1 <= node_id <= 127:

@@ -149,7 +149,7 @@ def _bar() -> Iterator[Callable[[int, int, str], None]]:
 
 def _facts(job: Job, done: ResultSummary) -> dict[str, Any]:
     """Return the result of a job as JSON-compatible data."""
-    sums, fields = done.sums, max(done.sums.fields, 1)
+    sums = done.sums
     return {
         "recording": str(job.recording.path),
         "settings": {setting.key: setting.text for setting in job.variant},
@@ -159,7 +159,7 @@ def _facts(job: Job, done: ResultSummary) -> dict[str, Any]:
         "touched": sums.touched,
         "contacts": sums.contacts,
         "deepest_m": sums.deepest_m,
-        "mean_std_m": sums.std_sum_m / fields,
+        "mean_std_m": sums.std_sum_m / sums.known_std if sums.known_std else None,
         "solve_s": sums.cpu_s,
         "notes": list(done.notes),
         "faults": list(done.faults),
@@ -173,13 +173,13 @@ def _print(results: Sequence[dict[str, Any]]) -> None:
     numbers = ("fields", "untrusted", "touched", "contacts", "deepest µm", "σz µm", "µs/field")
     shown = table("file", *keys, *numbers, right=numbers)
     for result in results:
-        each_us = 1e6 * result["solve_s"] / max(result["fields"], 1)
+        std_m, each_us = result["mean_std_m"], 1e6 * result["solve_s"] / max(result["fields"], 1)
         shown.add_row(
             Path(result["file"]).name,
             *result["settings"].values(),
             *(str(result[name]) for name in numbers[:4]),
             f"{1e6 * result['deepest_m']:.1f}",
-            f"{1e6 * result['mean_std_m']:.3f}",
+            "-" if std_m is None else f"{1e6 * std_m:.3f}",
             f"{each_us:.0f}",
         )
     out = console()

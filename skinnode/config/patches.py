@@ -16,7 +16,6 @@ from skinnode.config.table import (
     Length,
     Name,
     NodeId,
-    Ratio,
     Stiffness,
     Table,
     existing_file,
@@ -34,6 +33,9 @@ Coordinates = Literal["preset", "node"]
 
 _Resistivity = Annotated[
     float, Field(ge=1e-3, le=1e15, allow_inf_nan=False), Allowed("a number from 1e-3 to 1e15 (ohm/m)")
+]
+_Noise = Annotated[
+    float, Field(ge=1e-12, lt=1, allow_inf_nan=False), Allowed("a number of at least 1e-12 and below 1")
 ]
 _RUBBER = Rubber()
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
@@ -197,7 +199,7 @@ class PatchConfig(Table):
     )
     """Required serial number of the node (0x1018:4). If None, the host accepts any serial number. If no node
     answers at the node-ID, the host finds the node by its serial number over LSS and assigns the node-ID."""
-    relative_noise: Ratio = 3e-6
+    relative_noise: _Noise = 3e-6
     """Relative standard deviation of the analogue noise in a resistance measurement, excluding
     quantization."""
     baseline: Annotated[

@@ -88,6 +88,19 @@ def discard_leftovers(path: Path) -> None:
                 discard(Path(entry.path))
 
 
+def flush_file(path: Path) -> None:
+    """Flush the content of a file to the storage medium, also if other code has written the file.
+
+    Raises:
+        OSError: The content cannot be written.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def flush_folder(folder: Path) -> None:
     """Flush the entries of ``folder`` to the storage medium, so that renames survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -82,7 +82,7 @@ class ScanSolver:
         Returns:
             Stamped field with read-only arrays, and the number of codes that are not measurements.
         """
-        self._tracker.scan = stamp.scan
+        self._tracker.scan, self._tracker.t_ns = stamp.scan, stamp.t_sync_ns or stamp.t_receive_ns
         field, invalid = self._tracker.update_codes(verdict.admitted(scan).codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
         field = sealed(field, contacts=contacts, stamp=stamp.solved_at(self._now()))

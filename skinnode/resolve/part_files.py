@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from skinnode.errors import SkinError
-from skinnode.files.whole_file import SUFFIX, discard, flush_folder
+from skinnode.files.whole_file import SUFFIX, discard, flush_file, flush_folder
 
 _OFFSET: Final = struct.Struct("<q")
 """Offset of the summary, stored at the end of a part."""
@@ -61,8 +61,6 @@ class PartFiles:
                 writer = PartWriter(file)
                 yield writer
                 writer.end()
-                file.flush()
-                os.fsync(file.fileno())
             put_in_place(temporary, path)
         except BaseException:
             discard(temporary)
@@ -133,6 +131,11 @@ def beside(path: Path) -> Path:
 
 
 def put_in_place(temporary: Path, path: Path) -> None:
-    """Rename a complete file to its final name and flush its folder to disk."""
+    """Flush a complete file to disk, rename it to its final name and flush its folder to disk.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    flush_file(temporary)
     os.replace(temporary, path)
     flush_folder(path.parent)

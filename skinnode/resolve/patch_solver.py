@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -40,6 +41,8 @@ class SolveSummary:
     """Largest displacement into the skin, m."""
     std_sum_m: float = 0.0
     """Sum over the fields of the median standard deviation of z, m; unknown deviations are left out."""
+    known_std: int = 0
+    """Number of fields in ``std_sum_m``."""
     cpu_s: float = 0.0
     """CPU time spent on solving, s."""
     rest_m: tuple[Float, ...] = ()
@@ -53,6 +56,7 @@ class SolveSummary:
             self.contacts + other.contacts,
             max(self.deepest_m, other.deepest_m),
             self.std_sum_m + other.std_sum_m,
+            self.known_std + other.known_std,
             self.cpu_s + other.cpu_s,
         )
 
@@ -113,12 +117,14 @@ class PatchFields:
 
     def _count(self, field: FieldFrame, cpu_s: float) -> None:
         std_m = float(np.median(field.displacement_std_m[..., 2]))
+        known = math.isfinite(std_m)
         self._summary += SolveSummary(
             1,
             int(not field.trusted),
             int(bool(field.touched)),
             len(field.contacts),
             float(-field.displacement_m[..., 2].min()),
-            std_m if std_m < float("inf") else 0.0,
+            std_m if known else 0.0,
+            int(known),
             cpu_s,
         )

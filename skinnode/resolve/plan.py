@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,12 +31,10 @@ class Job:
 
     def units(self, parts: PartFiles) -> list[Unit]:
         """Return the unfinished units; none if the file is complete."""
-        if self.write.key in parts and self.write.target.exists():
+        if self.write.finished(parts):
             return []
-        parts.remove(self.write.key)
-        solves: list[Unit] = [unit for unit in self.solves if unit.key not in parts]
-        captures = [unit for unit in self.captures if unit.key not in parts]
-        return [*captures, *solves, self.write]
+        units: list[Unit] = [*self.captures, *self.solves]
+        return [*(unit for unit in units if not unit.finished(parts)), self.write]
 
 
 def make_plan(
@@ -56,13 +55,15 @@ def make_plan(
             recording are divided among several units, each of which must read the whole recording.
 
     Raises:
-        ConfigError: Two results would have the same name, or a setting is not allowed for a hand.
+        ConfigError: Two results would have the same name, two variants give the same hand, or a setting is
+            not allowed for a hand.
     """
     jobs: list[Job] = []
     groups = -(-workers // len(recordings))
     for recording, hand in recordings:
-        for variant in variants:
-            changed = apply(hand, variant)
+        applied = [apply(hand, variant) for variant in variants]
+        _require_different(variants, applied)
+        for variant, changed in zip(variants, applied, strict=True):
             name = file_name(recording.path.stem, variant if len(variants) > 1 else ())
             jobs.append(_job(recording, changed, variant, folder / f"{name}{suffix}", groups))
     targets = [job.write.target for job in jobs]
@@ -75,8 +76,23 @@ def make_plan(
 
 def file_name(stem: str, variant: Variant) -> str:
     """Return the name of a result without its suffix: the recording's name and the settings."""
+    if not variant:
+        return stem
     text = "-".join([stem, *name_of(variant).split()])
-    return re.sub(r"[^\w.=+-]+", "_", text)[:_MOST_NAME] if variant else stem
+    name = re.sub(r"[^\w.=+-]+", "_", text)
+    if len(name) <= _MOST_NAME:
+        return name
+    return f"{name[: _MOST_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _require_different(variants: Sequence[Variant], hands: Sequence[HandConfig]) -> None:
+    """Raise ConfigError if two variants give the same hand, because they would have the same results."""
+    seen: dict[str, Variant] = {}
+    for variant, hand in zip(variants, hands, strict=True):
+        before = seen.setdefault(hand.model_dump_json(), variant)
+        if before is not variant:
+            allowed = f"values that differ; these have the same effect as {name_of(before)}"
+            raise ConfigError("--set", name_of(variant), allowed)
 
 
 def _job(recording: Recording, hand: HandConfig, variant: Variant, target: Path, groups: int) -> Job:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -23,12 +24,14 @@ from skinnode.resolve.recording import Recording
 FORMATS: Final = (PARQUET, MCAP)
 
 
-def write_result(
+@contextmanager
+def new_result(
     recording: Recording, hand: HandConfig, solved: tuple[str, ...], target: Path, parts: PartFiles
-) -> None:
+) -> Iterator[None]:
     """Write the fields of all patches to a new file, in the order of a replay.
 
-    The file appears under its final name only when it is complete.
+    The file is complete when the block begins, and appears under its final name when the block ends without
+    an error.
 
     Args:
         recording: The recording.
@@ -45,6 +48,7 @@ def write_result(
     try:
         write = _write_mcap if target.suffix == MCAP else _write_parquet
         write(recording, hand, solved, temporary, parts)
+        yield
         put_in_place(temporary, target)
     except OSError as error:
         discard(temporary)

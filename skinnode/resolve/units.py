@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from skinnode.resolve.identity import difference, identity
 from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.patch_solver import PatchFields, SolveSummary
 from skinnode.resolve.recording import Recording
-from skinnode.resolve.result_file import write_result
+from skinnode.resolve.result_file import new_result
 from skinnode.resolve.scan_capture import Capture, CaptureSummary
 
 
@@ -38,12 +38,12 @@ class Unit:
 
     @cached_property
     def key(self) -> str:
-        """Hash of everything that determines the result, including the software.
+        """Hash of everything that determines the result, including the software and the hand's files.
 
-        After an update, an interrupted run therefore does not continue with parts of the older version.
+        After an update or a change of a file, an interrupted run therefore does not continue with old parts.
         """
         content = [type(self).__name__, repr(self.recording), self.hand.model_dump_json()]
-        content.append(repr(sorted(_own_identity().items())))
+        content += [repr(sorted(_own_identity().items())), *_hashes_of_files(self.hand)]
         return hashlib.sha256("\n".join([*content, *self.details]).encode()).hexdigest()[:24]
 
     @property
@@ -53,6 +53,10 @@ class Unit:
 
     def __str__(self) -> str:
         return self.recording.path.name
+
+    def finished(self, parts: PartFiles) -> bool:
+        """Return whether the result exists."""
+        return self.key in parts
 
     def run(self, parts: PartFiles) -> None:
         """Compute the result and write its part file. Raises SkinError if the result cannot be computed."""
@@ -166,10 +170,19 @@ class WriteResult(Unit):
         """The file, and the keys of the solved patches."""
         return (str(self.target), *self.solved)
 
+    def finished(self, parts: PartFiles) -> bool:
+        """Return whether both the part and the file exist."""
+        return super().finished(parts) and self.target.exists()
+
     def run(self, parts: PartFiles) -> None:
-        """Write the file."""
-        write_result(self.recording, self.hand, self.solved, self.target, parts)
-        with parts.new(self.key) as part:
+        """Write the part, then the file.
+
+        In this order, a file without a part is always a foreign file, even if this process is killed.
+        """
+        with (
+            new_result(self.recording, self.hand, self.solved, self.target, parts),
+            parts.new(self.key) as part,
+        ):
             part.summary = self._summary(parts)
 
     def _summary(self, parts: PartFiles) -> ResultSummary:
@@ -191,7 +204,8 @@ def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> 
         worker: Name of this worker, for error messages.
 
     Raises:
-        SkinError: This process has different software or cannot see the work folder, or the unit fails.
+        SkinError: This process has different software, cannot see the work folder or finds different files,
+            or the unit fails.
     """
     found = difference(expected, _own_identity())
     if found is not None:
@@ -201,7 +215,13 @@ def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> 
             f"worker {worker}: cannot see the folder {folder}; use a folder that all workers share"
         )
     parts = PartFiles(Path(folder))
-    if unit.key not in parts:
+    fresh = replace(unit)  # computes its key in this process, from the files that it sees
+    if fresh.key != unit.key:
+        raise SkinError(
+            "a file that the hand names is not the file that the command started with; run the command "
+            "again, or make the file available to all workers under this path"
+        )
+    if not unit.finished(parts):
         unit.run(parts)
     return unit.key
 
@@ -212,6 +232,21 @@ def refused(worker: str, found: str) -> SkinError:
         f"worker {worker}: refused, because it has {found}, and its results could differ; "
         "install the same version there, or end that worker"
     )
+
+
+def _hashes_of_files(hand: HandConfig) -> list[str]:
+    """Return the hash of each file that the hand names, and whose content affects the result.
+
+    Raises:
+        SkinError: A file cannot be read.
+    """
+    named = [
+        path for patch in hand.patches for path in (patch.layout.file, patch.baseline) if path is not None
+    ]
+    try:
+        return [hashlib.sha256(path.read_bytes()).hexdigest() for path in named]
+    except OSError as error:
+        raise SkinError(f"{error.filename}: cannot be read ({error.strerror})") from None
 
 
 _identity: dict[str, Any] = {}

@@ -63,6 +63,8 @@ class Tracker:
         options: Options in effect.
         method: Method in use, ``exact`` or ``posterior``. With ``auto``, it can change during a stream.
         reason: Short explanation of why this method is in use.
+        t_ns: Time of the next frame on any monotonic clock, ns. After a gap in the stream, the detector
+            allows for drift in the meantime; if None (the default), gaps are not noticed.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -77,6 +79,7 @@ class Tracker:
         self.options = options = merged(TrackerOptions, options, arguments)
         self.layout = layout
         self.method, self.reason = self._chosen = choose_method(layout, options)
+        self.t_ns: int | None = None
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
@@ -239,6 +242,7 @@ class Tracker:
         assert self._rest is not None
         exact = self._exact is not None and self.method == "exact"
         check = self._check if exact else self._posterior.check
+        self._rest.t_ns = self.t_ns
         field = self._rest.see(ohm, valid, noise, check.left_out)
         if field is None:
             return None

@@ -308,6 +308,11 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             "patches[0].calibration.upper_gain: got [1.0, 1.01], allowed: 10 numbers, one per upper wire",
         ),
         (
+            ["patches", 0, "relative_noise"],
+            0.0,
+            "patches[0].relative_noise: got 0.0, allowed: a number of at least 1e-12 and below 1",
+        ),
+        (
             ["simulation", "depth"],
             1.0,
             "simulation.depth: got 1.0, allowed: a number of at least 0 and below 1",

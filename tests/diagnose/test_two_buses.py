@@ -58,6 +58,14 @@ def test_a_node_id_of_both_buses_is_asked_about(two_buses: Path, command: list[s
     )
 
 
+def test_a_patch_named_like_a_number_is_not_mistaken_for_a_node(two_buses: Path) -> None:
+    """The index, node 6, is renamed to 5, the node-ID of both other patches."""
+    two_buses.write_text(two_buses.read_text().replace('"index"', '"5"'))
+    assert run(["info", "5", "--hand", two_buses, "--json"]).json["serial"] == 65
+    assert run(["info", "0x5", "--hand", two_buses, "--bus", "right", "--json"]).json["serial"] == 55
+    assert run(["info", "5", "--hand", two_buses, "--bus", "right", "--json"]).json["serial"] == 65
+
+
 def test_a_node_id_of_no_patch_needs_a_bus(two_buses: Path) -> None:
     done = run(["info", "9", "--hand", two_buses])
     assert done.status == 2

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,20 @@ from rosbags.highlevel import AnyReader
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
-from skinnode.config import HandConfig
+from skinnode.config import HandConfig, load_hand
 from skinnode.errors import SkinError
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import PatchLayout
 from skinnode.record import replay
 from skinnode.record.convert import convert
 from skinnode.record.open_recording import open_recording
 from skinnode.resolve import processes, units
+from skinnode.resolve.identity import identity
 from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.plan import make_plan
 from skinnode.resolve.recording import recording_at
 from skinnode.resolve.run import WORK_FOLDER, run, work_folder
+from skinnode.resolve.settings import variants
 
 
 def resolve(*arguments: object, status: int = 0) -> Any:
@@ -206,6 +211,118 @@ def test_parts_of_another_version_are_not_used(
     assert len(job_of(recording, tmp_path).units(parts)) == every
 
 
+def foreign(recording: Path, folder: Path, lines: str = "") -> tuple[Path, Path]:
+    """Write the recording as another master's log, and a hand file with ``lines`` in each patch."""
+    opened = open_recording(recording)
+    opened.frames.close()
+    hand: HandConfig = opened.header.hand
+    log, plan = folder / "other.log", folder / "hand.toml"
+    log.write_bytes(recording.read_bytes())
+    sizes = ", ".join(f"{key} = {value}" for key, value in {"upper_wires": 4, "upper_electrodes": 4}.items())
+    text = "".join(f'[[buses]]\nname = "{bus.name}"\nchannel = "{bus.name}"\n' for bus in hand.buses)
+    for patch in hand.patches:
+        text += f'[[patches]]\nname = "{patch.name}"\nnode_id = {patch.node_id}\nbus = "{patch.bus}"\n{lines}'
+        text += f'tolerances = "exact"\nlayout = {{ {sizes}, lower_wires = 12, lower_electrodes = 4 }}\n'
+    plan.write_text(text + "[sync]\nperiod_ms = 25\n")
+    return log, plan
+
+
+def test_parts_of_another_baseline_are_not_used(recording: Path, tmp_path: Path) -> None:
+    """Neither by the next run, nor by a worker of this run that sees the new file."""
+    layout = PatchLayout.preset(
+        "staggered", upper_wires=4, upper_electrodes=4, lower_wires=12, lower_electrodes=4
+    )
+    at_rest_ohm = resistance_ohm(layout, layout.upper_m)
+    np.savetxt(tmp_path / "rest.txt", at_rest_ohm)
+    log, plan = foreign(recording, tmp_path, 'baseline = "rest.txt"\n')
+
+    def planned() -> Any:
+        (job,) = make_plan([recording_at(log, load_hand(plan))], [()], tmp_path, ".parquet", 1)
+        return job
+
+    parts, job = PartFiles(tmp_path), planned()
+    units.run_unit(job.captures[0], str(tmp_path), identity(), "a worker")
+    assert planned().units(parts) == [*job.solves, job.write]
+    np.savetxt(tmp_path / "rest.txt", 1.1 * at_rest_ohm)
+    changed = planned()
+    assert changed.units(parts) == [*changed.captures, *changed.solves, changed.write]
+    assert not {unit.key for unit in job.units(parts)} & {unit.key for unit in changed.units(parts)}
+    with pytest.raises(SkinError, match="is not the file that the command started with"):
+        units.run_unit(job.solves[0], str(tmp_path), identity(), "a worker")
+    (tmp_path / "rest.txt").unlink()
+    with pytest.raises(SkinError, match=r"rest\.txt: cannot be read"):
+        units.run_unit(changed.solves[0], str(tmp_path), identity(), "a worker")
+
+
+class InTurn:
+    """Runs the units in this process, one after the other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.count, self._folder, self._waiting = 1, folder, list[units.Unit]()
+
+    def submit(self, unit: units.Unit) -> None:
+        self._waiting.append(unit)
+
+    def finished(self, timeout_s: float) -> list[str]:
+        return [units.run_unit(self._waiting.pop(0), str(self._folder), identity(), "this process")]
+
+    def close(self) -> None:
+        pass
+
+
+class Killed(BaseException):
+    """Stands in for SIGKILL."""
+
+
+def test_a_command_killed_at_any_rename_of_its_result_continues(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before and after the renames of the result and of its part, whichever is first."""
+    replace, kills = os.replace, 0
+    synced: list[str] = []
+    fsync = os.fsync
+
+    def watched(descriptor: int) -> None:
+        synced.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+        fsync(descriptor)
+
+    def killing(source: Path, target: Path) -> None:
+        nonlocal kills
+        of_result = Path(target).name in ("run.parquet", f"{job.write.key}.part")
+        if of_result:
+            assert str(source) in synced  # complete on disk before it gets its name
+            for done in (False, True):
+                if (Path(target).name, done) not in spared:
+                    spared.add((Path(target).name, done))
+                    kills += 1
+                    if done:
+                        replace(source, target)
+                    raise Killed
+        replace(source, target)
+
+    with work_folder(tmp_path / "out") as folder:
+        job = job_of(recording, tmp_path / "out", 1)
+        spared: set[tuple[str, bool]] = set()
+        monkeypatch.setattr(os, "replace", killing)
+        monkeypatch.setattr(os, "fsync", watched)
+        for _ in range(10):
+            with suppress(Killed):
+                (summary,) = run([job], InTurn(folder), PartFiles(folder), lambda *_: None)
+                break
+        monkeypatch.undo()
+    assert kills == 4
+    assert os.listdir(tmp_path / "out") == ["run.parquet"]
+    assert pq.read_table(tmp_path / "out" / "run.parquet").num_rows == summary.sums.fields > 250
+
+
+def test_results_of_long_settings_have_different_names(recording: Path, tmp_path: Path) -> None:
+    gains = [f"[{', '.join(['1.000000000000001'] * 3)}, {last}]" for last in ("1.0", "1.1")]
+    chosen = variants([f"patches.p0.calibration.upper_gain={','.join(gains)}"])
+    jobs = make_plan([recording_at(recording, None)], chosen, tmp_path, ".parquet", 1)
+    assert len({job.write.target for job in jobs}) == 2
+    assert all(len(job.write.target.name) <= 128 for job in jobs)
+
+
 COMMAND = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "resolve"]
 
 
@@ -231,6 +348,25 @@ def test_a_killed_command_continues_where_it_was(recording: Path, tmp_path: Path
     assert (out / "run.parquet").read_bytes() == wanted.read_bytes()
     assert os.listdir(out) == ["run.parquet"]
     assert result["fields"] == len(list(replay(recording)))
+
+
+def test_unknown_deviations_do_not_lower_the_mean(recording: Path, tmp_path: Path) -> None:
+    """In the second half, three quarters of the PDOs are missing; most wires cannot be solved."""
+    lossy = tmp_path / "lossy.log"
+    lines = recording.read_text().splitlines(keepends=True)
+    ids = [int(line.split()[2].partition("#")[0], 16) for line in lines]
+    lossy.write_text("".join(
+        line for n, (line, cob_id) in enumerate(zip(lines, ids, strict=True))
+        if n < len(lines) // 2 or n % 4 == 0 or not 0x180 <= cob_id < 0x580
+    ))  # fmt: skip
+    lossy.with_suffix(".jsonl").write_bytes(recording.with_suffix(".jsonl").read_bytes())
+    setting = "solver.method=exact"
+    (result,) = resolve(lossy, "-o", tmp_path, "--set", setting, "--processes", 1, status=1)
+    table = pq.read_table(result["file"]).to_pylist()
+    medians = np.array([np.median(np.array(row["displacement_std_m"]).reshape(-1, 3)[:, 2]) for row in table])
+    known = np.isfinite(medians)
+    assert 0.1 < known.mean() < 0.9
+    assert result["mean_std_m"] == pytest.approx(medians[known].mean(), rel=1e-9)
 
 
 def test_two_commands_do_not_share_a_folder(recording: Path, tmp_path: Path) -> None:
@@ -269,6 +405,18 @@ def test_a_damaged_recording_is_solved_and_named(recording: Path, tmp_path: Path
         (
             ["--set", "solver.method=exact", "--set", "solver.drift=wire"],
             "cannot be solved with these settings",
+        ),
+        (
+            ["--set", "solver.max_std_m=1e-3,0.001"],
+            "values that differ; these have the same effect as max_std_m=1e-3",
+        ),
+        (
+            ["--set", "solver.method=exact,exact"],
+            "values that differ; these have the same effect as method=exact",
+        ),
+        (
+            ["--set", "patches.*.relative_noise=0"],
+            "patches[0].relative_noise: got 0, allowed: a number of at least",
         ),
         (["--processes", "1", "--scheduler", "tcp://127.0.0.1:1"], "allowed: only without --scheduler"),
     ],
@@ -309,22 +457,10 @@ def test_a_recording_that_changes_meanwhile_is_refused(recording: Path, tmp_path
 
 
 def test_a_log_of_another_master_is_solved_with_the_hand_file(recording: Path, tmp_path: Path) -> None:
-    opened = open_recording(recording)
-    opened.frames.close()
-    hand: HandConfig = opened.header.hand
-    (tmp_path / "other.log").write_bytes(recording.read_bytes())
-    sizes = ", ".join(f"{key} = {value}" for key, value in {"upper_wires": 4, "upper_electrodes": 4}.items())
-    text = "".join(f'[[buses]]\nname = "{bus.name}"\nchannel = "{bus.name}"\n' for bus in hand.buses)
-    for patch in hand.patches:
-        text += f'[[patches]]\nname = "{patch.name}"\nnode_id = {patch.node_id}\nbus = "{patch.bus}"\n'
-        text += f'tolerances = "exact"\nlayout = {{ {sizes}, lower_wires = 12, lower_electrodes = 4 }}\n'
-    plan = tmp_path / "hand.toml"
-    plan.write_text(text + "[sync]\nperiod_ms = 25\n")
+    log, plan = foreign(recording, tmp_path)
     arguments = ["--hand", plan, "--processes", 2, "-o", tmp_path / "out"]
-    (result,) = resolve(tmp_path / "other.log", *arguments, status=0)
-    from skinnode.config import load_hand
-
+    (result,) = resolve(log, *arguments, status=0)
     wanted = tmp_path / "wanted.parquet"
-    convert(tmp_path / "other.log", wanted, hand=load_hand(plan))
+    convert(log, wanted, hand=load_hand(plan))
     assert Path(result["file"]).read_bytes() == wanted.read_bytes()
     assert len(result["notes"]) == 3

@@ -153,7 +153,38 @@ def test_codes_that_change_in_place_are_decoded_again() -> None:
         assert one.touch_odds == other.touch_odds
 
 
+@pytest.mark.parametrize("timed", [True, False])
+def test_drift_during_a_gap_is_no_touch_if_the_times_are_known(timed: bool) -> None:
+    """The scans pause for eight hours, in which the gain of each wire changes by 3 %, up or down."""
+    rng = np.random.default_rng(11)
+    follower = tracker(1e-3)
+    gains = 1.0 + 0.03 * rng.choice((-1.0, 1.0), (REST.shape[0], 1))
+    touched = []
+    for number in range(90):
+        paused_s = 0.0 if number < 50 else 8 * 3600.0
+        follower.t_ns = round(1e9 * (0.08 * number + paused_s)) if timed else None
+        ohm = REST * (1.0 if number < 50 else gains)
+        touched.append(follower.update(ohm * (1.0 + 1e-3 * rng.standard_normal(REST.shape))).touched)
+    assert not any(touched[:50])
+    assert any(touched[50:]) is not timed
+
+
+def test_times_of_a_stream_without_gaps_change_nothing() -> None:
+    """Also if they jitter, and if a second is missing."""
+    rng = np.random.default_rng(12)
+    timed, untimed = tracker(1e-3), tracker(1e-3)
+    for number in range(120):
+        missing = 12 if number > 60 else 0
+        timed.t_ns = round(1e9 * 0.08 * (number + missing + rng.uniform(-0.4, 0.4)))
+        ohm = REST * (1.0 + 1e-3 * rng.standard_normal(REST.shape))
+        one, other = timed.update(ohm), untimed.update(ohm)
+        assert (one.touched, one.touch_odds) == (other.touched, other.touch_odds)
+        np.testing.assert_array_equal(one.displacement_std_m, other.displacement_std_m)
+
+
 def test_options_of_the_detector_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"relative_noise: got 0\.0, must be positive and finite"):
+        tracker(0.0)
     for name in ("false_alarms_per_hour", "scan_period_s"):
         with pytest.raises(ValueError, match=name):
             tracker(1e-3, **{name: 0.0})

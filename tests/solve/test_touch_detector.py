@@ -149,6 +149,27 @@ def test_lost_readings_neither_alarm_nor_hide_a_press() -> None:
     assert all(stream.see(np.where(np.arange(30) == 4, np.nan, sphere(0.03)), 10)[3:])
 
 
+@pytest.mark.parametrize("lost", [True, False])
+def test_drift_while_no_scan_is_usable_is_no_touch(lost: bool) -> None:
+    """For five minutes, scans are lost or without readings; the gains drift as much as the prior expects."""
+    stream = Stream(noise=1e-4, drift="walk")
+    frames = round(300.0 / PERIOD_S)
+    touched: list[bool | None] = []
+    for _ in range(10):
+        for gain in stream.gains:
+            gain += 0.01 * np.sqrt(300.0 / 3600.0) * stream.rng.standard_normal(gain.shape)
+        if lost:
+            stream.detector.miss(frames)
+        else:
+            for _ in range(frames):
+                stream.detector.see(np.full(REST.shape, np.nan))
+        touched += stream.see(REST, 60)
+        pressed = stream.see(sphere(0.05), 10)
+        assert all(pressed[3:])
+        assert not any(stream.see(REST, 60)[30:])
+    assert not any(touched)
+
+
 def test_noise_that_is_not_as_stated_is_neither_a_touch_nor_hides_one() -> None:
     """From 0.7 to 1.4 times the stated noise, where the noise estimate of the tracker does not act."""
     for factor in (0.7, 1.4):

@@ -19,12 +19,15 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
 from skinnode.process.clock import perf_counter
 from skinnode.solve.detect.touch_detector import TouchDetector, TouchVerdict
-from skinnode.solve.inputs import broadcast_noise
+from skinnode.solve.inputs import checked_noise
 from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISIER: Final = 1.25
 """Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
+GAP_S: Final = 2.0
+"""Time between two frames, s, above which the detector counts the frames that are missing between them. In a
+shorter time, the drift is too small to matter."""
 SAME: Final = 0.1
 """Maximum relative change in noise that leaves a rest field valid."""
 
@@ -38,11 +41,12 @@ class RestGate:
 
     Attributes:
         detector: Touch detector of the patch.
+        t_ns: Time of the next frame, ns; None if unknown. Without times, gaps in the stream are not noticed.
     """
 
     def __init__(self, layout: PatchLayout, options: TrackerOptions) -> None:
         problem = PatchProblem.of(layout, options.baseline_ohm)
-        noise, codes = np.array(broadcast_noise(options.relative_noise, layout)), options.codes
+        noise, codes = np.array(checked_noise(options.relative_noise, layout)), options.codes
         rounding = np.zeros(layout.shape)
         if codes is not None:
             noise = np.full(layout.shape, codes.relative_noise)
@@ -59,7 +63,8 @@ class RestGate:
             false_alarms_per_hour=options.false_alarms_per_hour,
             gain_std=_gain_std(layout, options),
         )
-        self._factor = 1.0
+        self._factor, self._period_s = 1.0, options.scan_period_s
+        self.t_ns: int | None = None
         self._stated, self._layout = float(np.median(noise)), layout
         self.reset()
 
@@ -71,6 +76,7 @@ class RestGate:
         self._used: NDArray[np.bool_] | None = None
         self._noise_of_field: Float | None = None
         self._noise: Float | None = None
+        self._last_ns: int | None = None
 
     def see(
         self,
@@ -88,6 +94,7 @@ class RestGate:
             left_out: (U, K) bool: True for faulty readings; None if no readings are faulty.
         """
         start = perf_counter()
+        self._count_missing()
         if left_out is not None:
             valid = ~left_out if valid is None else valid & ~left_out
         if noise is not None:
@@ -111,6 +118,16 @@ class RestGate:
             touched=self._verdict.touched,
             touch_odds=self._verdict.odds,
         )
+
+    def _count_missing(self) -> None:
+        """Pass the number of frames that are missing since the last frame to the detector."""
+        last_ns, self._last_ns = self._last_ns, self.t_ns
+        if last_ns is None or self.t_ns is None:
+            return
+        since_s = 1e-9 * (self.t_ns - last_ns)
+        missing = round(since_s / self._period_s) - 1
+        if since_s > GAP_S and missing > 0:
+            self.detector.miss(missing)
 
     def add(self, field: FieldFrame) -> FieldFrame:
         """Return a solved frame's field with ``touched`` and ``touch_odds`` filled in."""

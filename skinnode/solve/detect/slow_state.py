@@ -155,7 +155,7 @@ class SlowState:
             present: (U, K) mask of the available readings; None if all are available.
             noise: Noise variance of the stream, relative to the stated variance.
         """
-        self._pass_frame()
+        self._pass(1)
         self._sum += y
         if present is not None:
             if not self._missing:
@@ -182,13 +182,24 @@ class SlowState:
 
     def skip(self) -> bool:
         """Count a frame without using it; return whether :attr:`level` changed."""
-        self._pass_frame()
+        self._pass(1)
         return self._grow()
 
-    def _pass_frame(self) -> None:
-        self.age += 1
+    def miss(self, frames: int) -> bool:
+        """Count frames that were lost or have too few readings; return whether :attr:`level` changed.
+
+        After a long gap, the frames that have not been used yet are discarded, because the gains may have
+        drifted since.
+        """
+        self._pass(frames)
+        if self.age > self._base:
+            self.discard()
+        return self._grow()
+
+    def _pass(self, frames: int) -> None:
+        self.age += frames
         if self._released is not None:
-            self._released += 1
+            self._released += frames
 
     def _grow(self) -> bool:
         """Adapt the level to the age of the gains; return whether the level changed."""
@@ -198,7 +209,7 @@ class SlowState:
         return self.level != before
 
     def discard(self) -> None:
-        """Discard the frames that have not been used yet, because a touch was detected."""
+        """Discard the frames that have not been used yet, because of a touch or a gap."""
         self._clear_block()
         self._waiting = False
         self._means.clear()

@@ -167,9 +167,8 @@ class TouchDetector:
         """Discard the state of the stream; assume an untouched patch and a fresh baseline."""
         self.touched = False
         self._noise, self._noise_frames = 1.0, NOISE_START
-        self._at, self._frames = 0, 0
+        self._at = self._frames = self._clock = 0  # the clock counts frames
         self._log_odds = -math.inf
-        self._clock = 0  # frames
         self._crept_peak, self._crept_at = 0.0, 0  # last touch that was not itself creep
         self._slow.reset()
         self._use_test()
@@ -251,22 +250,30 @@ class TouchDetector:
         its.weight[:] = weight
         self._at = (self._at + 1) % KEPT
         self._frames = min(self._frames + 1, KEPT)
-        self._clock += 1
         self._compute(self._noise * (1.0 + self._slow.offset_share))
         found = its.found.tolist()
         if found[COUNT] < ENOUGH * its.ohm.size:
-            self._frames = 0
-            self._slow.skip()
+            self.miss(1)
             return TouchVerdict(None, bounded_exp(self._log_odds), False)
+        self._clock += 1
         self._follow_noise(found)
-        variance = self._noise * (1.0 + self._slow.offset_share)
-        scaled = [each / variance for each in found[:3]]
+        variance, quiet = self._noise * (1.0 + self._slow.offset_share), False
         if self.touched:
             self._follow_touch(variance)
-            quiet = False
         else:
-            quiet = self._follow_rest(scaled, found)
+            quiet = self._follow_rest([each / variance for each in found[:3]], found)
         return TouchVerdict(self.touched, bounded_exp(self._log_odds), quiet)
+
+    def miss(self, frames: int) -> None:
+        """Count frames that were lost or have too few readings; the gains may have drifted in the meantime.
+
+        Args:
+            frames: Number of frames.
+        """
+        self._clock += frames
+        self._frames = 0
+        if self._slow.miss(frames) and not self.touched:
+            self._change_test()
 
     def _compute(self, variance: float) -> None:
         its = self._test.statistic

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
@@ -82,9 +83,10 @@ def convert(
     if source.suffix == target.suffix == MCAP and hand is None:
         return _copy_mcap(source, target)
     recording = open_recording(source) if hand is None else open_log(source, hand)
-    if target.suffix in TABLES:
-        return _tabulate(recording, target)
-    return _copy_frames(recording, target, fields=target.suffix == MCAP and not frames_only)
+    with closing(recording.frames):
+        if target.suffix in TABLES:
+            return _tabulate(recording, target)
+        return _copy_frames(recording, target, fields=target.suffix == MCAP and not frames_only)
 
 
 def _check(source: Path, target: Path, hand: HandConfig | None) -> None:

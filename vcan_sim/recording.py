@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import re
 import threading
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -36,9 +37,19 @@ FAULTS: Final = "faults.jsonl"
 SCENE: Final = "scene.json"
 
 
-def channel_of(bus: str) -> str:
-    """Return the channel name that represents a bus in a trace. Spaces become underscores."""
-    return re.sub(r"\s", "_", bus)
+def channels_of(buses: Iterable[str]) -> dict[str, str]:
+    """Return each bus's channel in a trace: its name, in which spaces become underscores.
+
+    No two buses have the same channel.
+    """
+    names = list(buses)
+    channels = {name: name for name in names if not re.search(r"\s", name)}
+    for name in names:
+        channel = re.sub(r"\s", "_", name)
+        while name not in channels and channel in channels.values():
+            channel += "_"
+        channels.setdefault(name, channel)
+    return channels
 
 
 class Recording:
@@ -78,8 +89,10 @@ class Recording:
             (self._folder / SCENE).write_text(text, encoding="utf-8")
         with ExitStack() as opened:
             self._trace = opened.enter_context((self._folder / TRACE).open("w", encoding="ascii"))
-            for bus in self._fleet.hand.buses:
-                opened.enter_context(Listener(bus, self._write, channel_of(bus.name)))
+            buses = self._fleet.hand.buses
+            channels = channels_of(bus.name for bus in buses)
+            for bus in buses:
+                opened.enter_context(Listener(bus, self._write, channels[bus.name]))
             self._open = opened.pop_all()
         self.poll()
         return self

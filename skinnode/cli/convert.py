@@ -83,6 +83,7 @@ def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
     """Draw a recording and save the drawing as a Rerun file."""
     from skinnode.errors import ConfigError
     from skinnode.record.convert import Conversion
+    from skinnode.transport.frame_log import create_binary
     from skinnode.view.file_conversion import convert_to_file
     from skinnode.view.viewer_process import require_viewer
 
@@ -91,6 +92,7 @@ def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
         raise ConfigError("target", str(target), "a new file; this one exists and is not overwritten")
     if not target.parent.is_dir():
         raise ConfigError("target", str(target), "a file in an existing folder")
+    create_binary(target).close()  # fails if another command has created the file
     try:
         done = convert_to_file(source, target, exaggeration=_EXAGGERATION, hand=hand)
     except BaseException:

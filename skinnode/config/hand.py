@@ -104,6 +104,22 @@ class HandConfig(Table):
                 raise ConfigError(f"--{key}", value, "a name")
         return self.model_copy(update={"buses": tuple(bus.model_copy(update=kept) for bus in self.buses)})
 
+    def without_layout_files(self) -> HandConfig:
+        """Return a copy of the hand that contains the electrodes of its layout files.
+
+        Raises:
+            ConfigError: A layout file cannot be used.
+        """
+        patches = [p.model_copy(update={"layout": p.layout.without_file()}) for p in self.patches]
+        return self.model_copy(update={"patches": tuple(patches)})
+
+    def table(self) -> dict[str, Any]:
+        """Return a table from which :func:`parse_hand` builds an equal hand."""
+        table = self.model_dump(exclude_defaults=True)
+        # the period is required if the host is a guest, even if it has the default value
+        table.setdefault("sync", {})["period_ms"] = self.sync.period_ms
+        return table
+
     @model_validator(mode="before")
     @classmethod
     def _counts(cls, table: Any) -> Any:
@@ -236,7 +252,8 @@ def _check_geometry(key: str, patch: PatchConfig) -> None:
     except ValueError as error:
         if patch.layout.file is not None:
             raise ConfigError(f"{key}.layout.file", str(patch.layout.file), f"a layout ({error})") from None
-        raise impossible(error, f"{key}.layout") from None
+        table = "layout" if patch.layout.electrodes is None else "layout.electrodes"
+        raise impossible(error, f"{key}.{table}") from None
     gains, wires = patch.calibration.upper_gain, layout.shape[0]
     if gains is not None and len(gains) != wires:
         allowed = f"{wires} numbers, one per upper wire"

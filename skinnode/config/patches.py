@@ -24,7 +24,7 @@ from skinnode.config.table import (
 from skinnode.config.toml_text import read_toml
 from skinnode.errors import ConfigError
 from skinnode.model.elastic import Rubber
-from skinnode.model.layout import PatchLayout
+from skinnode.model.layout import PatchLayout, require_array
 from skinnode.model.layout_file import from_electrodes, has_electrodes, impossible, read_npz
 from skinnode.model.tolerances import EXACT, ORDINARY, Tolerances
 
@@ -42,8 +42,46 @@ _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a n
 _Tolerance = Annotated[
     float, Field(ge=0, lt=0.5, allow_inf_nan=False), Allowed("a number of at least 0 and below 0.5")
 ]
+_Position = Annotated[tuple[float, float, float], Field(strict=False)]
+_Wire = Annotated[tuple[_Position, ...], Field(strict=False)]
+_Wires = Annotated[
+    tuple[_Wire, ...],
+    Field(strict=False),
+    Allowed("a list of wires, each a list of electrodes, each a list of three numbers (m)"),
+]
+_SHAPES: Final = {"upper_m": ("U", "N", 3), "lower_m": ("K", "M", 3)}
 _NAMED_TOLERANCES: Final = {"ordinary": ORDINARY, "exact": EXACT}
 _TOLERANCES: Final = '"ordinary", "exact" or a table of numbers'
+
+
+class ElectrodesConfig(Table):
+    """Contents of a layout file. Recordings contain layout files in this form; a hand file names the file."""
+
+    upper_m: _Wires
+    """Positions of the upper electrodes at rest, metres: x, y and z of each electrode of each wire."""
+    lower_m: _Wires
+    """Positions of the lower electrodes, metres: x, y and z of each electrode of each wire."""
+    resistivity_ohm_per_m: _Resistivity
+    """Resistance of the rubber between two electrodes, divided by their distance, ohm per metre."""
+    name: str = "custom"
+    """Name of the layout in messages."""
+
+    def build(self) -> PatchLayout:
+        """Return the layout. Raises ValueError if the geometry is impossible."""
+        upper_m, lower_m = (
+            require_array(name, getattr(self, name), shape) for name, shape in _SHAPES.items()
+        )
+        return PatchLayout(upper_m, lower_m, self.resistivity_ohm_per_m, self.name)
+
+    @classmethod
+    def of(cls, layout: PatchLayout) -> ElectrodesConfig:
+        """Return the electrodes of ``layout``; :meth:`build` restores every number exactly."""
+        return cls(
+            upper_m=layout.upper_m.tolist(),
+            lower_m=layout.lower_m.tolist(),
+            resistivity_ohm_per_m=layout.resistivity_ohm_per_m,
+            name=layout.name,
+        )
 
 
 class LayoutConfig(Table):
@@ -53,6 +91,9 @@ class LayoutConfig(Table):
     """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML file with the other
     keys of this table. If a file is given, the only other key allowed in the table is ``coordinates``. The
     path is relative to the hand file."""
+    electrodes: ElectrodesConfig | None = None
+    """Contents of the layout file, in a recording. The only other key allowed in the table is
+    ``coordinates``."""
     preset: Annotated[Preset, one_of(Preset)] = "staggered"
     """Named arrangement of the electrodes."""
     pitch_m: Length = 4e-3
@@ -82,9 +123,10 @@ class LayoutConfig(Table):
 
     @model_validator(mode="after")
     def _file_or_keys(self) -> LayoutConfig:
-        if self.file is not None:
-            for key in sorted(self.model_fields_set - {"file", "coordinates"}):
-                raise ConfigError(key, getattr(self, key), "only without layout.file")
+        for source in ("file", "electrodes"):
+            if getattr(self, source) is not None:
+                for key in sorted(self.model_fields_set - {source, "coordinates"}):
+                    raise ConfigError(key, getattr(self, key), f"only without layout.{source}")
         return self
 
     def build(self) -> PatchLayout:
@@ -96,6 +138,8 @@ class LayoutConfig(Table):
         """
         if self.file is not None:
             return load_layout(self.file)
+        if self.electrodes is not None:
+            return self.electrodes.build()
         return PatchLayout.preset(
             self.preset,
             pitch_m=self.pitch_m,
@@ -106,6 +150,17 @@ class LayoutConfig(Table):
             lower_electrodes=self.lower_electrodes,
             resistivity_ohm_per_m=self.resistivity_ohm_per_m,
         )
+
+    def without_file(self) -> LayoutConfig:
+        """Return a table that contains the electrodes instead of the name of a layout file.
+
+        Raises:
+            ConfigError: The file cannot be used.
+        """
+        if self.file is None:
+            return self
+        electrodes = ElectrodesConfig.of(load_layout(self.file))
+        return LayoutConfig(electrodes=electrodes, coordinates=self.coordinates)
 
 
 class CalibrationConfig(Table):

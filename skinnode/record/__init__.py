@@ -7,7 +7,7 @@ themselves, that affected how the host decoded them. ``open_recording`` opens re
 file, logs from other masters; ``mcap_chunks`` and ``mcap_reader`` read MCAP files that may be damaged.
 ``replay`` decodes the frames with the host's own code. ``convert`` converts recordings to other formats: it
 repairs MCAP files with ``copy_mcap`` and writes field tables with ``field_rows``, ``parquet_file`` and
-``npz_file``.
+``npz_file``; ``new_file`` deletes a file that could not be completed.
 """
 
 from skinnode.record.follow import followed

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
@@ -24,6 +24,7 @@ from skinnode.record.journal import journal_of, new_journal_of
 from skinnode.record.keeping_solver import KeepingSolver
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import MCAP, McapFile
+from skinnode.record.new_file import NewFile, kept_if_complete
 from skinnode.record.npz_file import NpzFile, read_npz
 from skinnode.record.open_recording import FRAME_FILES, Frames, OpenRecording, open_log, open_recording
 from skinnode.record.parquet_file import ParquetFile, read_parquet
@@ -53,14 +54,11 @@ class Conversion:
     """Messages about assumptions and about data that the target cannot contain."""
 
 
-class FieldTable(Protocol):
+class FieldTable(NewFile, Protocol):
     """New field table."""
 
     def write(self, row: FieldRow) -> None:
         """Write a row."""
-
-    def close(self) -> None:
-        """Complete the file."""
 
 
 def convert(
@@ -77,26 +75,22 @@ def convert(
     Raises:
         ConfigError: The source cannot be read, the target exists or cannot be written, the conversion is not
             supported, or the packages for a format are not installed.
+        OSError: The target cannot be written, for example because the disk is full.
     """
-    taken = _check(source, target, hand)
-    try:
-        if source.suffix in TABLES:
-            return _copy_table(source, target)
-        if source.suffix == target.suffix == MCAP and hand is None:
-            return _copy_mcap(source, target)
-        recording = open_recording(source) if hand is None else open_log(source, hand)
+    _check(source, target, hand)
+    if source.suffix in TABLES:
+        return _copy_table(source, target)
+    if source.suffix == target.suffix == MCAP and hand is None:
+        return _copy_mcap(source, target)
+    recording = open_recording(source) if hand is None else open_log(source, hand)
+    with closing(recording.frames):
         if target.suffix in TABLES:
             return _tabulate(recording, target)
         return _copy_frames(recording, target, fields=target.suffix == MCAP and not frames_only)
-    except BaseException:
-        with suppress(OSError):
-            for path in taken:
-                path.unlink(missing_ok=True)
-        raise
 
 
-def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
-    """Return the files to create. Raises ConfigError if the conversion is unsupported or a file exists."""
+def _check(source: Path, target: Path, hand: HandConfig | None) -> None:
+    """Raise ConfigError if the conversion is unsupported or a file to be created exists."""
     if source.suffix not in TARGETS:
         raise ConfigError("source", str(source), _ending_in(TARGETS))
     allowed = TABLES if source.suffix in TABLES else TARGETS
@@ -113,7 +107,6 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> list[Path]:
             raise ConfigError("target", str(path), "a new file; this one exists and is not overwritten")
     if not target.parent.is_dir():
         raise ConfigError("target", str(target), "a file in an existing folder")
-    return taken
 
 
 def _share_journal(source: Path, target: Path) -> bool:
@@ -156,23 +149,18 @@ def _rows(run: Replay, kept: deque[ResistanceFrame]) -> Iterator[FieldRow]:
 
 
 def _write_table(target: Path, hand: str, rows: Iterator[FieldRow]) -> int:
-    table: FieldTable = ParquetFile(target, hand) if target.suffix == PARQUET else NpzFile(target, hand)
+    new: FieldTable = ParquetFile(target, hand) if target.suffix == PARQUET else NpzFile(target, hand)
     count = 0
-    try:
+    with kept_if_complete(new) as table:
         for row in rows:
             table.write(row)
             count += 1
-    except BaseException:
-        if isinstance(table, NpzFile):
-            table.discard()
-        raise
-    table.close()
     return count
 
 
 def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Conversion:
     hand = recording.header.hand
-    file = (
+    new = (
         McapFile(target, hand)
         if target.suffix == MCAP
         else LogFiles(
@@ -181,17 +169,17 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
             journal=not (recording.foreign or _share_journal(recording.frames.path, target)),
         )
     )
-    tee = CopiedFrames(recording, file)
-    run = Replay(replace(recording, frames=tee))
-    if fields and isinstance(file, McapFile):
-        for field in run:
-            assert field.stamp is not None
-            rest_m = run.layout(field.stamp.patch).upper_m
-            write_computed_field(file, field, rest_m, run.wall_minus_mono_ns)
-    else:
-        for _ in run.frames():
-            pass
-    file.close()
+    with kept_if_complete(new) as file:
+        tee = CopiedFrames(recording, file)
+        run = Replay(replace(recording, frames=tee))
+        if fields and isinstance(file, McapFile):
+            for field in run:
+                assert field.stamp is not None
+                rest_m = run.layout(field.stamp.patch).upper_m
+                write_computed_field(file, field, rest_m, run.wall_minus_mono_ns)
+        else:
+            for _ in run.frames():
+                pass
     written = file.fields if isinstance(file, McapFile) else 0
     return Conversion(file.frames, written, tuple(run.flaws), (*run.notes, *_losses(recording, target, tee)))
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
+from skinnode.files.whole_file import discard
 from skinnode.messages.definitions import CAN_FRAME, FD_FRAME, JOURNAL_LINE
 from skinnode.messages.fields import POINT_CLOUD
 from skinnode.messages.typestore import decode, encode, message_type, require_mcap
@@ -16,6 +17,8 @@ from skinnode.transport.frame_log import create_binary
 if TYPE_CHECKING:
     from mcap.records import Message
     from mcap.writer import Writer
+
+    from skinnode.record.mcap_chunks import McapChunks
 
 
 def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
@@ -28,49 +31,63 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
         Numbers of CAN frames and fields copied, and a one-line message for each damaged part.
 
     Raises:
-        ConfigError: The source is not an MCAP file, or the target cannot be created.
+        ConfigError: The source is not an MCAP file, or the target exists or cannot be created.
+        OSError: The target cannot be written; it is deleted.
     """
     require_mcap(str(source))
-    from mcap.writer import CompressionType, Writer
-
-    from skinnode.record.mcap_chunks import TRUNCATED, McapChunks
+    from skinnode.record.mcap_chunks import McapChunks
 
     chunks = McapChunks(source, lambda schema: None)
-    counts: dict[str, int] = {}
-    with create_binary(target) as file:
-        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        writer.start(profile=PROFILE, library="skinnode")
-        schemas: dict[int, int] = {}
-        channels: dict[int, int] = {}
-        last: tuple[int, Message] | None = None  # newest journal line and its channel in the copy
-        ended = False
-        for item in chunks.messages(None):
-            channel, message, schema = item.channel, item.message, item.schema
-            if channel.id not in channels:
-                if schema is not None and schema.id not in schemas:
-                    schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-                number = 0 if schema is None else schemas[schema.id]
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
-            )
-            name = "" if schema is None else schema.name
-            counts[name] = counts.get(name, 0) + 1
-            if name == JOURNAL_LINE:
-                last = (channels[channel.id], message)
-                ended = ended or _ends(message.data)
-        inside = sum(damage.what != TRUNCATED for damage in chunks.damages)
-        if last is not None and (inside or not ended):
-            frames = counts.get(CAN_FRAME, 0) + counts.get(FD_FRAME, 0)
-            _add_repaired(writer, *last, frames=frames, damaged=inside)
-        writer.finish()
+    file = create_binary(target)
+    try:
+        with file:
+            counts = _copy(chunks, file)
+    except BaseException:
+        discard(target)
+        raise
     faults = [f"{source.name} {damage}" for damage in chunks.damages]
     if chunks.damaged > len(faults):
         faults.append(f"{chunks.damaged - len(faults)} more damaged places")
     frames = counts.get(CAN_FRAME, 0) + counts.get(FD_FRAME, 0)
     return frames, counts.get(POINT_CLOUD, 0), faults
+
+
+def _copy(chunks: McapChunks, file: BinaryIO) -> dict[str, int]:
+    """Copy the readable messages; return the number of messages of each schema."""
+    from mcap.writer import CompressionType, Writer
+
+    from skinnode.record.mcap_chunks import TRUNCATED
+
+    counts: dict[str, int] = {}
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+    writer.start(profile=PROFILE, library="skinnode")
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    last: tuple[int, Message] | None = None  # newest journal line and its channel in the copy
+    ended = False
+    for item in chunks.messages(None):
+        channel, message, schema = item.channel, item.message, item.schema
+        if channel.id not in channels:
+            if schema is not None and schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            number = 0 if schema is None else schemas[schema.id]
+            channels[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, number, channel.metadata
+            )
+        writer.add_message(
+            channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+        )
+        name = "" if schema is None else schema.name
+        counts[name] = counts.get(name, 0) + 1
+        if name == JOURNAL_LINE:
+            last = (channels[channel.id], message)
+            ended = ended or _ends(message.data)
+    inside = sum(damage.what != TRUNCATED for damage in chunks.damages)
+    if last is not None and (inside or not ended):
+        frames = counts.get(CAN_FRAME, 0) + counts.get(FD_FRAME, 0)
+        _add_repaired(writer, *last, frames=frames, damaged=inside)
+    writer.finish()
+    return counts
 
 
 def _ends(data: bytes) -> bool:

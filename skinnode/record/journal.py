@@ -9,7 +9,8 @@ the event, and ``t_ns`` is its time on the host's monotonic clock.
 ``event``      meaning
 =============  ==============================================================================
 ``resumed``    scans of ``patch`` are decoded with ``facts`` (baseline, scale, serial number, and the layout
-               if it differs from the hand's) or, without ``facts``, with the same solver as before;
+               if it differs from that in the first line) or, without ``facts``, with the same solver as
+               before;
                ``anew``: scans assembled so far are discarded
 ``withheld``   scans of ``patch`` are no longer decoded
 ``polled``     a timeout ended an incomplete scan
@@ -28,12 +29,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from skinnode.config import BusConfig, HandConfig, PatchConfig, parse_hand
+from skinnode.config import BusConfig, HandConfig, PatchConfig, SyncConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host.node_facts import NodeFacts
 from skinnode.model.layout import PatchLayout
@@ -66,9 +68,13 @@ COMPLAINTS_KEPT: Final = 100
 """Maximum number of unreadable lines reported individually; further lines are only counted."""
 
 _MOST: Final = 2**63 - 1
+_LONGEST_HEADER: Final = 32 << 20
+"""Maximum length of the first line in bytes. The layout files of a hundred of the largest patches fit."""
 _LONGEST_LINE: Final = 2 << 20
 """Maximum length of a line in bytes. An event containing the baseline and layout of the largest patch fits; a
 longer line is read as several lines."""
+_BESIDE_FILE: Final = {"coordinates"}
+"""Keys that a patch's layout table may contain next to the name of a layout file."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -81,16 +87,18 @@ class Header:
     """Local date and time at which the recording began, in ISO 8601 format."""
     wall_minus_mono_ns: int
     """Log timestamp minus time on the host's monotonic clock, in ns."""
+    layoutless: frozenset[str] = frozenset()
+    """Names of the patches whose layout file is missing from an old journal."""
 
     def line(self) -> str:
-        """Return the header as a line of JSON."""
-        table = _without_paths(self.hand.model_dump(exclude_defaults=True))
+        """Return the header as a line of JSON. Raises ConfigError if a layout file cannot be used."""
+        table = _without_paths(self.hand.without_layout_files().table())
         times = {"started": self.started, "wall_minus_mono_ns": self.wall_minus_mono_ns}
         return json.dumps({"format": FORMAT, **times, "hand": table})
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names, because the journal contains the data from those files."""
+    """Remove file names, because the journal contains the layouts and the baselines from those files."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -99,9 +107,31 @@ def _without_paths(value: Any) -> Any:
     return value
 
 
-def facts_table(facts: NodeFacts) -> dict[str, Any]:
-    """Convert NodeFacts to a JSON object that preserves every number exactly."""
-    layout, planned = facts.layout, facts.config.layout.build()
+def _hand_of(table: Mapping[str, Any], where: str) -> HandConfig:
+    """Parse the hand in a header, without the checks that require a baseline file or a non-default period."""
+    buses = [{**bus, "guest_sends": "sdo"} if bus.get("role") == "guest" else bus for bus in table["buses"]]
+    sync = {"period_ms": SyncConfig().period_ms, **table.get("sync", {})}
+    return parse_hand({**table, "buses": buses, "sync": sync}, where=where)
+
+
+def _layoutless(table: Mapping[str, Any]) -> frozenset[str]:
+    """Return the patches whose layout file an older version has left out.
+
+    Only the name of a layout file leaves such a table behind: no key allowed next to it, except
+    ``coordinates``, has a value.
+    """
+    patches = [patch for patch in table["patches"] if "layout" in patch]
+    return frozenset(patch["name"] for patch in patches if not {*patch["layout"]} - _BESIDE_FILE)
+
+
+def facts_table(facts: NodeFacts, planned: PatchLayout) -> dict[str, Any]:
+    """Convert NodeFacts to a JSON object that preserves every number exactly.
+
+    Args:
+        facts: The facts.
+        planned: Layout that a reader builds from its hand; the object contains the layout if it differs.
+    """
+    layout = facts.layout
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
     own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}
     own["resistivity_ohm_per_m"] = layout.resistivity_ohm_per_m
@@ -170,7 +200,8 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], l
     try:
         with path.open("rb") as file:
             kept: list[bytes] = []
-            lines = iter(lambda: file.readline(_LONGEST_LINE), b"")
+            first = file.readline(_LONGEST_HEADER)
+            lines = chain((first,), iter(lambda: file.readline(_LONGEST_LINE), b""))
             parsed = parse_journal(str(path), path.name, _noted(lines, kept))
             return *parsed, kept
     except OSError as error:
@@ -208,13 +239,14 @@ def parse_journal(
         if first["format"] != FORMAT:
             raise ConfigError("format", first["format"], repr(FORMAT), where=where)
         header = Header(
-            parse_hand(first["hand"], where=where),
+            _hand_of(first["hand"], where),
             str(first["started"]),
             _whole(first["wall_minus_mono_ns"], least=-_MOST),
+            _layoutless(first["hand"]),
         )
     except ConfigError:
         raise
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         shown = line.rstrip(b"\n")[:40].decode("ascii", "replace")
         raise ConfigError("line 1", shown, "the header of a recording's journal", where=where) from None
     events: list[dict[str, Any]] = []

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+from itertools import count
 from pathlib import Path
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
+from skinnode.files.whole_file import discard
 from skinnode.record.journal import new_journal_of
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import FrameLog, LoggedFrame, create
@@ -65,23 +67,35 @@ class LogFiles:
             self._journal.flush()
 
     def close(self) -> None:
-        """Close the files. Disk errors are ignored because earlier calls have reported them."""
-        if self._journal is not None:
-            with contextlib.suppress(OSError):
+        """Close both files, even if writing fails."""
+        try:
+            if self._journal is not None:
                 self._journal.close()
-        self._log.close()
+        finally:
+            self._log.close()
 
-    def remove(self) -> None:
-        """Delete the files."""
-        self.path.unlink(missing_ok=True)
+    def discard(self) -> None:
+        """Close and delete the files."""
+        with contextlib.suppress(Exception):  # the files may be closed already
+            self.close()
+        discard(self.path)
         if self._journal is not None:
-            self._journal_path.unlink(missing_ok=True)
+            discard(self._journal_path)
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return each bus's channel in the log: the bus name if candump accepts it, otherwise bus0, bus1, …."""
-    names = {}
+    """Return each bus's channel in the log: the bus name if candump accepts it, otherwise bus0, bus1, ….
+
+    No two buses have the same channel.
+    """
+    names = {bus.name: bus.name for bus in hand.buses if _is_plain(bus.name)}
     for number, bus in enumerate(hand.buses):
-        plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16
-        names[bus.name] = bus.name if plain else f"bus{number}"
-    return names
+        if bus.name not in names:
+            free = (name for n in count(number) if (name := f"bus{n}") not in names.values())
+            names[bus.name] = next(free)
+    return {bus.name: names[bus.name] for bus in hand.buses}
+
+
+def _is_plain(name: str) -> bool:
+    """Return whether candump accepts ``name`` as a channel."""
+    return name.isascii() and name.isalnum() and not name.isdigit() and len(name) < 16

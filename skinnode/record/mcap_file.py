@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skinnode.config import HandConfig
+from skinnode.files.whole_file import discard
 from skinnode.host.events import HealthEvent
 from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.skeleton import Skeleton
@@ -159,17 +160,19 @@ class McapFile:
         self.flush(to_disk=False)
 
     def close(self) -> None:
-        """Write the index and close the file, ignoring disk errors, which earlier calls have reported."""
-        with contextlib.suppress(OSError):
+        """Write the index to disk and close the file, even if writing fails."""
+        try:
             self._writer.finish()
             self._file.flush()
             os.fsync(self._file.fileno())
-        with contextlib.suppress(OSError):
+        finally:
             self._file.close()
 
-    def remove(self) -> None:
-        """Delete the file."""
-        self.path.unlink(missing_ok=True)
+    def discard(self) -> None:
+        """Close and delete the file."""
+        with contextlib.suppress(Exception):  # the file may be closed already
+            self.close()
+        discard(self.path)
 
     def _write(self, topic: str, name: str, message: Any, publish_ns: int, log_ns: int) -> None:
         channel = self._channels.get(topic)

@@ -9,6 +9,7 @@ import io
 import tempfile
 import zipfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -16,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.errors import ConfigError
+from skinnode.files.whole_file import discard
 from skinnode.record.field_rows import CROSSINGS, FORMAT, NUMBERS, POINTS, TEXTS, WIRES, FieldRow
 from skinnode.record.parquet_file import check_format
+from skinnode.transport.frame_log import create_binary
 
 _ROWS_AT_ONCE: Final = 4096
 _COLUMNS: Final = (*NUMBERS, *TEXTS, *WIRES, *POINTS, *CROSSINGS)
@@ -31,10 +34,14 @@ class NpzFile:
     Args:
         path: Path of the new file.
         hand: First line of the journal, which contains the hand; empty if unknown.
+
+    Raises:
+        ConfigError: The file already exists or cannot be created.
     """
 
     def __init__(self, path: Path, hand: str) -> None:
         self._path, self._hand = path, hand
+        self._file = create_binary(path)
         self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-")
         self._patches: dict[str, _Rows] = {}
 
@@ -48,14 +55,21 @@ class NpzFile:
 
     def close(self) -> None:
         """Write the file and delete the temporary files."""
-        with self._folder, zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as members:
+        with (
+            self._folder,
+            self._file,
+            zipfile.ZipFile(self._file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as members,
+        ):
             for name, text in ((_FORMAT_NAME, FORMAT), (_HAND_NAME, self._hand)):
                 _write(members, name, np.array(text))
             for patch, rows in self._patches.items():
                 rows.write(members, patch)
 
     def discard(self) -> None:
-        """Delete the temporary files."""
+        """Delete the file and the temporary files."""
+        with suppress(OSError):
+            self._file.close()
+        discard(self._path)
         self._folder.cleanup()
 
 

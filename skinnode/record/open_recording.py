@@ -153,7 +153,7 @@ def open_log(path: Path, hand: HandConfig) -> OpenRecording:
                 "t_ns": 0,
                 "event": "resumed",
                 "patch": patch.name,
-                "facts": facts_table(facts),
+                "facts": facts_table(facts, layout),
                 "line": 1 + len(events),
             }
         )

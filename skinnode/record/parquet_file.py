@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -10,7 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.errors import ConfigError, Shown
+from skinnode.files.whole_file import discard
 from skinnode.record.field_rows import CROSSINGS, FORMAT, NUMBERS, POINTS, PREFIX, TEXTS, WIRES, FieldRow
+from skinnode.transport.frame_log import create_binary
 
 ROWS_PER_GROUP: Final = 512
 """Number of rows per row group. A row group is held in memory: about 10 MB for patches of 10 × 30 wires."""
@@ -33,6 +36,9 @@ class ParquetFile:
     Args:
         path: Path of the new file.
         hand: First line of the journal, which contains the hand; empty if unknown.
+
+    Raises:
+        ConfigError: The file already exists or cannot be created, or the package pyarrow is missing.
     """
 
     def __init__(self, path: Path, hand: str) -> None:
@@ -43,6 +49,8 @@ class ParquetFile:
         self._schema = schema
         # dictionary-encoding measured numbers saves no space and takes four times as long as all else
         texts = ["patch", *TEXTS]
+        create_binary(path).close()
+        self._path = path
         self._writer = pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
         self._rows: list[dict[str, Any]] = []
 
@@ -70,6 +78,12 @@ class ParquetFile:
         if self._rows:
             self._write_group()
         self._writer.close()
+
+    def discard(self) -> None:
+        """Close and delete the file."""
+        with suppress(Exception):  # the file may be closed already
+            self._writer.close()
+        discard(self._path)
 
     def _write_group(self) -> None:
         import pyarrow as pa

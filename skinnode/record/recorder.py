@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, NamedTuple, Self
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
@@ -51,7 +51,15 @@ RecordingFormat = Literal["log", "blf", "mcap"]
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log, .blf or .mcap"
 
-_Entry = Callable[[], None]
+_Job = Callable[[], None]
+
+
+class _Entry(NamedTuple):
+    """Job of the recorder's thread, and the numbers of frames and fields that it writes."""
+
+    job: _Job
+    frames: int = 0
+    fields: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +69,13 @@ class RecorderStats:
     frames: int
     """Number of frames written."""
     dropped: int
-    """Number of frames not written because the disk was too slow or failed."""
+    """Number of frames not written: the disk was too slow or failed, or writing raised an exception."""
     failure: str | None
     """One-line reason why recording stopped; None while it continues."""
     fields: int = 0
     """Number of fields written; only an MCAP file contains fields."""
     fields_dropped: int = 0
-    """Number of fields not written because the disk was too slow or failed."""
+    """Number of fields not written for the same reasons."""
 
 
 def name_in(folder: Path, hand: HandConfig, kind: RecordingFormat, now: datetime.datetime) -> Path:
@@ -115,7 +123,7 @@ class Recorder:
     begins while the host is running (:meth:`Host.tap`) lacks the initial state of the solvers. If an
     exception ends the ``with`` block before the first frame, the empty recording is deleted. If the disk
     fails (OSError), recording ends with a log message and the host continues. If writing an entry raises any
-    other exception, the entry is lost and counted in ``dropped``.
+    other exception, the rest of the entry is lost, and its frames are counted in ``dropped``.
 
     Args:
         hand: The hand.
@@ -124,8 +132,8 @@ class Recorder:
         kind: File format if ``path`` is a folder.
 
     Raises:
-        ConfigError: The recording or its journal already exists, a file or folder cannot be created, or the
-            packages for .mcap are not installed.
+        ConfigError: The recording or its journal already exists, a file or folder cannot be created, a layout
+            file cannot be used, or the packages for .mcap are not installed.
     """
 
     def __init__(self, hand: HandConfig, path: Path | str, kind: RecordingFormat = "log") -> None:
@@ -138,6 +146,7 @@ class Recorder:
         elif path.suffix not in (*SUFFIXES, MCAP):
             raise ConfigError("recording", asked, _ALLOWED)
         offset_ns = clock.time_ns() - clock.monotonic_ns()
+        hand = hand.without_layout_files()
         self._mcap = McapFile(path, hand) if path.suffix == MCAP else None
         self._file = LogFiles(path, hand) if self._mcap is None else self._mcap
         self.path = path
@@ -147,6 +156,7 @@ class Recorder:
         self._bus_of = {patch.name: patch.bus for patch in hand.patches}
         self._solvers: dict[str, ScanSolver] = {}
         self._lost = self._lost_reported = self._fields_lost = 0
+        self._unwritten = self._fields_unwritten = 0  # counted by the recorder's thread
         self._lost_before: list[Callable[[], int]] = []
         self._defects = Defects(str(path))
         self._flush_s = self._sync_s = clock.monotonic()
@@ -159,9 +169,9 @@ class Recorder:
 
     def stats(self) -> RecorderStats:
         """Return the number of frames recorded and lost so far."""
-        fields = 0 if self._mcap is None else self._mcap.fields
-        fields_lost = self._fields_lost + sum(lost() for lost in self._lost_before)
-        return RecorderStats(self._file.frames, self._lost, self._failure, fields, fields_lost)
+        frames, fields = self._counts()
+        fields_lost = self._fields_lost + self._fields_unwritten + sum(lost() for lost in self._lost_before)
+        return RecorderStats(frames, self._lost + self._unwritten, self._failure, fields, fields_lost)
 
     @property
     def records_fields(self) -> bool:
@@ -173,18 +183,20 @@ class Recorder:
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch of received frames."""
         log_ns = clock.monotonic_ns() + self._offset_ns
-        self._put(lambda: self._write_frames(bus, frames, log_ns, sent=False), len(frames))
+        self._put(_Entry(lambda: self._write_frames(bus, frames, log_ns, sent=False), len(frames)))
 
     def sent(self, bus: str, frame: Frame) -> None:
         """Record a sent frame."""
         log_ns = clock.monotonic_ns() + self._offset_ns
-        self._put(lambda: self._write_frames(bus, (frame,), log_ns, sent=True), 1)
+        self._put(_Entry(lambda: self._write_frames(bus, (frame,), log_ns, sent=True), 1))
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Record that the host starts or resumes decoding a patch's scans."""
         known = self._solvers.get(patch) is solver
         self._solvers[patch] = solver
-        facts: dict[str, Any] = {} if known else {"facts": facts_table(solver.facts)}
+        facts: dict[str, Any] = {}
+        if not known:
+            facts["facts"] = facts_table(solver.facts, self._hand.patch(patch).layout.build())
         self._event(patch, "resumed", anew=anew, **facts)
 
     def withheld(self, patch: str) -> None:
@@ -208,21 +220,20 @@ class Recorder:
             return
         solver = self._solvers.get(field.stamp.patch)
         layout = self._hand.patch(field.stamp.patch).layout.build() if solver is None else solver.facts.layout
-        rest_m = layout.upper_m
-        entry = partial(file.write_field, field, rest_m, self._offset_ns, log_ns)
-        self._fields_lost += not self._put(entry, 0)
+        job = partial(file.write_field, field, layout.upper_m, self._offset_ns, log_ns)
+        self._put(_Entry(job, fields=1))
 
     def health(self, patches: Mapping[str, PatchHealth], buses: Mapping[str, BusHealth]) -> None:
         """Record the health of all patches and buses; callable from any thread."""
         if self._mcap is not None:
             log_ns = clock.monotonic_ns() + self._offset_ns
-            self._put(partial(self._mcap.write_health, patches, buses, log_ns), 0)
+            self._put(_Entry(partial(self._mcap.write_health, patches, buses, log_ns)))
 
     def event(self, event: HealthEvent) -> None:
         """Record an event; callable from any thread."""
         if self._mcap is not None:
             log_ns = clock.monotonic_ns() + self._offset_ns
-            self._put(partial(self._mcap.write_event, event, self._offset_ns, log_ns), 0)
+            self._put(_Entry(partial(self._mcap.write_event, event, self._offset_ns, log_ns)))
 
     def count_lost_fields(self, lost: Callable[[], int]) -> None:
         """Add a function that returns the number of fields lost before they reached the recorder."""
@@ -243,30 +254,32 @@ class Recorder:
         self.close()
         # Delete an empty recording, because its files would make a retry fail.
         if error is not None and not self._file.frames:
-            self._file.remove()
+            self._file.discard()
             if self._made is not None:
                 with suppress(OSError):  # another process may have written to the folder
                     self._made.rmdir()
 
-    def _put(self, entry: _Entry, frames: int) -> bool:
-        """Queue an entry with ``frames`` frames; return True if it was queued or is not needed."""
+    def _put(self, entry: _Entry) -> None:
+        """Queue an entry, or count it as lost."""
         if self._failure is not None or self._queue.qsize() >= CAPACITY:
-            self._lost += frames
-            return False
-        if self._thread.is_alive():
+            self._lost += entry.frames
+            self._fields_lost += entry.fields
+        elif self._thread.is_alive():
             self._queue.put(entry)
-        return True
 
     def _event(self, patch: str, event: str, *, t_ns: int | None = None, **more: Any) -> None:
         bus, t_ns = self._bus_of[patch], clock.monotonic_ns() if t_ns is None else t_ns
-        self._put(lambda: self._write_event(bus, t_ns, event, patch=patch, **more), 0)
+        self._put(_Entry(lambda: self._write_event(bus, t_ns, event, patch=patch, **more)))
 
     # --- methods called by the recorder's thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")
         self._try(lambda: self._write_event("", clock.monotonic_ns(), "ended", frames=self._file.frames))
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:
+            self._fail(error)
 
     def _turn(self) -> bool:
         """Write the next entry if one arrives within a flush interval; return False after the last entry."""
@@ -276,7 +289,7 @@ class Recorder:
             entry = self._queue.get(timeout=FLUSH_S)
             self._ended = entry is None
             if entry is not None:
-                self._try(entry)
+                self._write(entry)
         now_s = clock.monotonic()
         if now_s >= self._flush_s + FLUSH_S or self._ended:
             to_disk = now_s >= self._sync_s + SYNC_S
@@ -284,25 +297,42 @@ class Recorder:
             self._flush_s, self._sync_s = now_s, now_s if to_disk else self._sync_s
         return True
 
-    def _try(self, job: _Entry) -> None:
+    def _write(self, entry: _Entry) -> None:
+        """Write an entry; count its frames and fields that could not be written."""
+        before = self._counts()
+        self._try(entry.job)
+        frames, fields = self._counts()
+        self._unwritten += entry.frames - (frames - before[0])
+        self._fields_unwritten += entry.fields - (fields - before[1])
+
+    def _counts(self) -> tuple[int, int]:
+        """Return the numbers of frames and fields in the file."""
+        return self._file.frames, 0 if self._mcap is None else self._mcap.fields
+
+    def _try(self, job: _Job) -> None:
         if self._failure is not None:
             return
         try:
             job()
         except OSError as error:
+            self._fail(error)
+        except Exception as error:
+            self._defects.report("recording", error)
+
+    def _fail(self, error: OSError) -> None:
+        """End the recording because of a disk error; only the first error is reported."""
+        if self._failure is None:
             self._failure = (
                 f"{self.path}: recording ended, because writing to the disk failed ({error.strerror})"
             )
             _log.warning("%s", self._failure)
-        except Exception as error:
-            self._lost += 1
-            self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
         """Write and flush all data recorded so far."""
-        if self._lost != self._lost_reported:
-            lost, self._lost_reported = self._lost - self._lost_reported, self._lost
-            self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)
+        lost = self._lost + self._unwritten
+        if lost != self._lost_reported:
+            new, self._lost_reported = lost - self._lost_reported, lost
+            self._write_event("", clock.monotonic_ns(), "dropped", frames=new)
         self._file.flush(to_disk=to_disk)
 
     def _begin(self, header: Header) -> None:
@@ -314,8 +344,7 @@ class Recorder:
         file, offset_ns = self._file, self._offset_ns
         for frame in frames:
             file.write(bus, frame._replace(t_ns=frame.t_ns + offset_ns), sent=sent, log_ns=log_ns)
-        if not sent:
-            self._at[bus] += len(frames)
+            self._at[bus] += not sent
 
     def _write_event(self, bus: str, t_ns: int, event: str, **more: Any) -> None:
         place = {"bus": bus, "at": self._at.get(bus, 0), "t_ns": t_ns, "event": event}

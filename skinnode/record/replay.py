@@ -117,6 +117,8 @@ class Replay:
         header, events, self.complaints = recording.header, recording.events, recording.complaints
         """One-line message for each unreadable part of the journal."""
         self.hand, self.started = header.hand, header.started
+        self.layoutless = header.layoutless
+        """Names of the patches whose layout file is missing from an old journal."""
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = recording.frames
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 _ROUNDING_NS: Final = 2_000
 """Maximum rounding error of a log's timestamps, ns."""
+_LAYOUTLESS: Final = (
+    "the recording lacks the layout file of {patch}; solve it with skinnode resolve RECORDING --set "
+    "'patches.{patch}.layout={{file=\"FILE\"}}'"
+)
 
 
 class _PollerlessDispatcher(Dispatcher):
@@ -42,7 +46,7 @@ class ReplayedBus:
         self._dispatcher = _PollerlessDispatcher(config, {}, 0)
         output = StreamOutput(Inline(), replay.publisher)
         receive_bus(hand, self._dispatcher, self._ticks)
-        self._own_syncs = SyncFollower(self._ticks)
+        self._own_syncs = SyncFollower(self._ticks, hand.sync.period_s)
         self.patches: dict[str, PatchReception] = {
             patch.name: receive_patch(patch, hand, self._dispatcher, self._ticks, output)
             for patch in hand.patches_on(config.name)
@@ -152,6 +156,9 @@ class ReplayedBus:
         if "facts" in event:
             self._solvers[name] = None
             try:
+                if name in replay.layoutless and event["facts"]["layout"] is None:
+                    replay.complain(event, _LAYOUTLESS.format(patch=name))
+                    return None
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
                 self._solvers[name] = replay.solver_of(facts)
             except (KeyError, TypeError, OverflowError, ValueError) as error:

@@ -55,7 +55,7 @@ class Description:
         }
         table = {
             "versions": _VERSIONS,
-            "header": Header(_portable(self.hand), "", 0).line(),
+            "header": Header(self.hand, "", 0).line(),
             "layouts": layouts,
             "boot_id": self.boot_id,
             "commands": self.commands,
@@ -109,14 +109,6 @@ def ask(session: zenoh.Session, hand: str) -> Description | None:
         if reply.ok is not None:
             return Description.decode(reply.ok.payload.to_bytes(), hand)
     return None
-
-
-def _portable(hand: HandConfig) -> HandConfig:
-    """Return the hand without the setting that requires a baseline file, which programs lack."""
-    buses = tuple(
-        bus.model_copy(update={"guest_sends": "sdo"}) if bus.role == "guest" else bus for bus in hand.buses
-    )
-    return hand.model_copy(update={"buses": buses})
 
 
 def _layout(table: Mapping[str, Any]) -> PatchLayout:

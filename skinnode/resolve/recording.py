@@ -41,7 +41,9 @@ class Recording:
         if self.foreign:
             return open_log(self.path, hand)
         recording = open_recording(self.path)
-        header = replace(recording.header, hand=hand)
+        own = recording.header
+        same = {patch.name for patch in hand.patches if patch.layout == own.hand.patch(patch.name).layout}
+        header = replace(own, hand=hand, layoutless=own.layoutless & same)
         lines = [Header(hand, header.started, header.wall_minus_mono_ns).line(), *recording.lines[1:]]
         return replace(recording, header=header, lines=lines)
 

@@ -111,7 +111,7 @@ class Capture:
         return kept
 
     def _solver(self, facts: NodeFacts, hand: HandConfig, now: Callable[[], int]) -> ScanSolver:
-        self._kept.append(CapturedFacts(facts.config.name, facts_table(facts)))
+        self._kept.append(CapturedFacts(facts.config.name, facts_table(facts, facts.config.layout.build())))
         return _CapturingSolver(facts, self._keep)
 
     def _keep(self, scan: Scan, stamp: ScanStamp, verdict: Verdict) -> None:

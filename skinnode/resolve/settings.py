@@ -66,7 +66,7 @@ def apply(hand: HandConfig, variant: Variant) -> HandConfig:
     Raises:
         ConfigError: A patch or a key does not exist, or a value is not allowed.
     """
-    table = hand.model_dump(exclude_defaults=True)
+    table = hand.table()
     for setting in variant:
         for path in _paths(hand, setting):
             _set(table, path, setting)

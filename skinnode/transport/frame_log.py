@@ -46,7 +46,7 @@ class LoggedFrame(NamedTuple):
 class FrameLog:
     """Log file to which CAN frames are written. Only one thread may use it.
 
-    :meth:`write` and :meth:`flush` raise OSError if writing fails.
+    :meth:`write`, :meth:`flush` and :meth:`close` raise OSError if writing fails.
 
     Args:
         path: Path of the new file, ending in ``.log``, ``.blf`` or ``.asc``.
@@ -104,12 +104,12 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file. Disk errors are ignored here, because earlier calls have reported them."""
-        with contextlib.suppress(OSError):
+        """Write all frames to disk and close the file, even if writing fails."""
+        try:
             if self._is_asc and self._writer is not None:
                 self._file.write("End TriggerBlock\n")
             self.flush(to_disk=True)
-        with contextlib.suppress(OSError):
+        finally:
             self._file.close()
 
     def _open(self, t_ns: int) -> can.CanutilsLogWriter | can.BLFWriter | can.ASCWriter:

@@ -346,7 +346,7 @@ def test_an_entry_that_cannot_be_recorded_is_lost_and_counted(
         assert streams(host, "p0")
         assert eventually(lambda: recorder.stats().frames > written)
     stats = recorder.stats()
-    assert stats.dropped == broken.raised
+    assert stats.dropped >= broken.raised  # an entry contains one frame or more
     assert stats.failure is None
 
 

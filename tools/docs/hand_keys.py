@@ -91,7 +91,8 @@ def _kind(annotation: Any) -> str:
     if origin is Literal:
         return _TYPES[type(inside[0])]
     if origin is tuple:
-        return f"list of {_kind(inside[0])}s"
+        kind = _kind(inside[0])
+        return f"list of {kind.replace('list', 'lists', 1) if kind.startswith('list') else f'{kind}s'}"
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "table"
     return _TYPES[origin or annotation]

@@ -64,12 +64,14 @@ def _buses(
     """
     from skinnode.config import BusConfig, load_hand
     from skinnode.errors import ConfigError
-    from vcan_sim.recording import channel_of
+    from vcan_sim.recording import channels_of
     from vcan_sim.replay import channels_in
 
     channels = channels_in(trace)
     if hand is not None:
-        known = {channel_of(bus.name): bus for bus in load_hand(hand).on(interface, channel).buses}
+        buses = load_hand(hand).on(interface, channel).buses
+        channel_of = channels_of(bus.name for bus in buses)
+        known = {channel_of[bus.name]: bus for bus in buses}
         for name in channels:
             if name not in known:
                 raise ConfigError(str(trace), name, f"a bus of the hand: {', '.join(known)}")

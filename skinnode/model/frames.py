@@ -41,8 +41,8 @@ class ScanStamp:
     t_solved_ns: int = 0
     """Time at which the displacement field was ready; 0 if it is not ready yet."""
     run: int = 0
-    """Number of restarts of a remote hand's daemon since the program connected; 0 in a host. Scan numbers start
-    again in each run.
+    """Number of restarts of a remote hand's daemon since the program connected; 0 in a host. Scan numbers
+    start again in each run.
     """
 
     def solved_at(self, t_ns: int) -> ScanStamp:

@@ -56,7 +56,7 @@ class FieldCallback:
 
         The function itself may call ``close``.
         """
-        self._fields.end()
+        self._fields.close()
         self.join()
 
     def join(self) -> None:
@@ -80,7 +80,7 @@ class FieldCallback:
         try:
             field = self._fields.take(None)
         except SkinError as error:  # the error that stopped the host
-            _log.debug("callback %s: %s", _name(self._function), error)
+            _log.warning("callback %s is not called any more: %s", _name(self._function), error)
             return False
         if field is None:
             return False

@@ -66,6 +66,12 @@ class EventSubscription:
     def __init__(self, capacity: int) -> None:
         self._queue: DropOldestQueue[HealthEvent] = DropOldestQueue(capacity)
         self.dropped = 0
+        self._ended = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether a reader has reached the end because the host has closed; :meth:`get` no longer waits."""
+        return self._ended
 
     def get(self, timeout_s: float | None = None) -> HealthEvent | None:
         """Wait for the next event and return it.
@@ -80,7 +86,10 @@ class EventSubscription:
             event = self._queue.get(timeout_s)
         except queue.Empty:
             return None
-        return None if isinstance(event, End) else event
+        if isinstance(event, End):
+            self._ended = True
+            return None
+        return event
 
     def __iter__(self) -> Iterator[HealthEvent]:
         while (event := self.get()) is not None:

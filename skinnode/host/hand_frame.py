@@ -28,6 +28,11 @@ LATE: Final = "late"
 OVERTAKEN: Final = "overtaken"
 """Reason for a missing field: the patch has already delivered the field of a newer scan."""
 
+_Number = tuple[int, int]
+"""Run and scan number. Scan numbers start again in each run."""
+_BEFORE: Final = (0, 0)
+"""Number before the first scan of the first run."""
+
 
 @dataclass(frozen=True, eq=False)
 class HandFrame:
@@ -39,7 +44,8 @@ class HandFrame:
 
     scan: int
     """Scan number of all fields: the SYNC number, counted from the start of the host. It does not wrap
-    around.
+    around. In a remote hand, it starts again when the daemon restarts; ``stamp.run`` of the fields then
+    increases.
     """
     t_sync_ns: int
     """Monotonic time (ns) of the SYNC; 0 if unknown. With staggered SYNC (``sync.stagger_ms``), the buses
@@ -146,7 +152,7 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Assembles hand frames and returns them in order of scan number. Not thread-safe.
+    """Assembles hand frames and returns them in order of run and scan number. Not thread-safe.
 
     A hand frame is ready when each awaited patch has delivered the field of this or a later scan. After
     :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames without its field, a patch is not
@@ -169,11 +175,11 @@ class HandGatherer:
     ) -> None:
         self._patches, self._patience_ns, self._condition = tuple(patches), patience_ns, condition
         self._skeleton = Skeleton() if skeleton is None else skeleton
-        self._open: dict[int, dict[str, FieldFrame]] = {}
-        self._until_ns: dict[int, int] = {}
-        self._newest = dict.fromkeys(self._patches, 0)
+        self._open: dict[_Number, dict[str, FieldFrame]] = {}
+        self._until_ns: dict[_Number, int] = {}
+        self._newest = dict.fromkeys(self._patches, _BEFORE)
         self._absences = dict.fromkeys(self._patches, 0)
-        self._newest_given = 0
+        self._newest_given = _BEFORE
         self.late = 0
         """Number of fields that arrived after their hand frame had been delivered."""
 
@@ -181,41 +187,42 @@ class HandGatherer:
         """Add a field that arrived at monotonic time ``now_ns``."""
         stamp = field.stamp
         assert stamp is not None
-        self._newest[stamp.patch] = stamp.scan
+        number = stamp.run, stamp.scan
+        self._newest[stamp.patch] = number
         self._absences[stamp.patch] = 0
-        if stamp.scan <= self._newest_given:
+        if number <= self._newest_given:
             self.late += 1
             return
-        self._open.setdefault(stamp.scan, {})[stamp.patch] = field
-        self._until_ns.setdefault(stamp.scan, now_ns + self._patience_ns)
+        self._open.setdefault(number, {})[stamp.patch] = field
+        self._until_ns.setdefault(number, now_ns + self._patience_ns)
 
     def next(self, now_ns: int) -> HandFrame | None:
         """Return the oldest hand frame if it is ready at ``now_ns``, otherwise None."""
         if not self._open:
             return None
-        scan = min(self._open)
-        if now_ns < self._until_ns[scan] and any(self._awaited(patch, scan) for patch in self._patches):
+        number = min(self._open)
+        if now_ns < self._until_ns[number] and any(self._awaited(patch, number) for patch in self._patches):
             return None
-        fields = self._open.pop(scan)
-        del self._until_ns[scan]
-        self._newest_given = scan
+        fields = self._open.pop(number)
+        del self._until_ns[number]
+        self._newest_given = number
         absent = [patch for patch in self._patches if patch not in fields]
         for patch in absent:
             self._absences[patch] += 1
         stamps = [field.stamp for field in fields.values() if field.stamp is not None]
         t_sync_ns = max(stamp.t_sync_ns for stamp in stamps)
-        missing = {patch: self._reason(patch, scan) for patch in absent}
-        return HandFrame(scan, t_sync_ns, fields, missing, self._skeleton)
+        missing = {patch: self._reason(patch, number) for patch in absent}
+        return HandFrame(number[1], t_sync_ns, fields, missing, self._skeleton)
 
     def next_deadline_ns(self) -> int | None:
         """Return the deadline (ns) of the oldest hand frame; None if no hand frame is pending."""
         return self._until_ns[min(self._open)] if self._open else None
 
-    def _awaited(self, patch: str, scan: int) -> bool:
-        return self._newest[patch] < scan and self._absences[patch] < SCANS_MISSED
+    def _awaited(self, patch: str, number: _Number) -> bool:
+        return self._newest[patch] < number and self._absences[patch] < SCANS_MISSED
 
-    def _reason(self, patch: str, scan: int) -> str:
-        if self._newest[patch] > scan:
+    def _reason(self, patch: str, number: _Number) -> str:
+        if self._newest[patch] > number:
             return OVERTAKEN
         condition = self._condition(patch)
         return LATE if condition is Condition.OPERATIONAL else str(condition)
@@ -249,7 +256,7 @@ class HandSubscription(Closing):
             timeout_s: Time limit (s); None for no limit.
 
         Returns:
-            Next hand frame; None on timeout or once the host has closed.
+            Next hand frame; None on timeout, or once the host or the subscription has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -260,11 +267,11 @@ class HandSubscription(Closing):
             return None
 
     def close(self) -> None:
-        """End the subscription."""
+        """Stop accepting fields, and end the reader's loop. Thread-safe."""
         self._fields.close()
 
     def __iter__(self) -> Iterator[HandFrame]:
-        """Yield hand frames until the host closes.
+        """Yield hand frames until the host or the subscription closes.
 
         Raises:
             TimeoutError: if no hand frame arrives within the subscription's timeout.
@@ -280,7 +287,10 @@ class HandSubscription(Closing):
             yield frame
 
     async def __aiter__(self) -> AsyncIterator[HandFrame]:
-        """Yield hand frames until the host closes; asynchronous version of :meth:`__iter__`."""
+        """Yield hand frames until the host or the subscription closes.
+
+        Asynchronous version of :meth:`__iter__`.
+        """
         while True:
             end_ns = _end_ns(self._timeout_s)
             while (frame := self._gatherer.next(clock.monotonic_ns())) is None:
@@ -296,7 +306,7 @@ class HandSubscription(Closing):
             yield frame
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
-        """Return the next hand frame; None once the host has closed. Raise queue.Empty on timeout."""
+        """Return the next hand frame; None once the fields have ended. Raise queue.Empty on timeout."""
         check_timeout(timeout_s)
         end_ns = _end_ns(timeout_s)
         while (frame := self._gatherer.next(clock.monotonic_ns())) is None:

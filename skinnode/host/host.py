@@ -24,7 +24,7 @@ from skinnode.host.served_bus import ServedBus
 from skinnode.host.supervised import NodeStats
 from skinnode.host.sync import SyncStats
 from skinnode.host.tap import ContainedTap, HostTap, tap_bus
-from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS, tare
+from skinnode.host.tare import tare, tare_deadline_s
 from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
 from skinnode.transport import CanPort
@@ -243,7 +243,9 @@ class Host(RunningHand):
 
         return untap
 
-    def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
+    def tare(
+        self, patch: str, *, deadline_s: float | None = None, cancelled: Callable[[], bool] = never
+    ) -> None:
         """Tare a patch: make its current resistances the baseline.
 
         The host commands the tare with RPDO1. The call returns once the host has read the new baseline and
@@ -253,22 +255,24 @@ class Host(RunningHand):
         Args:
             patch: Name of the patch.
             deadline_s: Time limit (s) for the new baseline; 5 s plus three SYNC periods by default.
+            cancelled: Function that returns True to end the wait for the new baseline.
 
         Raises:
             KeyError: if there is no such patch.
+            ValueError: if ``deadline_s`` is negative, above 600 s or not a number.
             NodeError: if another master runs the bus, the baseline is kept in a file, or the node is not
                 operational.
             NodeTimeout: if no new baseline arrives before the deadline.
+            SkinError: if ``cancelled`` returned True.
             BusError: if the command cannot be sent.
         """
         node = self._nodes[patch]
-        if deadline_s is None:
-            deadline_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
         tare(
             node,
             lambda: self._supervisor.stats()[patch].baselines,
             lambda: self.health(patch),
-            deadline_s,
+            tare_deadline_s(self.hand, deadline_s),
+            cancelled,
         )
 
     def reset_node(self, patch: str) -> None:

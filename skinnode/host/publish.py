@@ -66,7 +66,7 @@ class Subscription(Closing):
             timeout_s: Time limit (s); None for no limit.
 
         Returns:
-            Next field; None on timeout or once the host has closed.
+            Next field; None on timeout, or once the host or the subscription has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -77,7 +77,7 @@ class Subscription(Closing):
             return None
 
     def take(self, timeout_s: float | None) -> FieldFrame | None:
-        """Return the next field; None once the host has closed.
+        """Return the next field; None once the host or the subscription has closed.
 
         Raises:
             queue.Empty: if no field arrives within ``timeout_s``.
@@ -114,16 +114,12 @@ class Subscription(Closing):
             del self._wakers[key]
 
     def close(self) -> None:
-        """Stop accepting fields."""
+        """Stop accepting fields, and end the readers' loops after the last queued field. Thread-safe."""
         self._subscribed = frozenset()
-
-    def end(self) -> None:
-        """Stop accepting fields, and end the reader's loop after the last queued field. Thread-safe."""
-        self.close()
         self.offer(End(), "")
 
     def __iter__(self) -> Iterator[FieldFrame]:
-        """Yield fields until the host closes.
+        """Yield fields until the host or the subscription closes.
 
         Raises:
             TimeoutError: if no field arrives within the subscription's timeout.
@@ -139,7 +135,10 @@ class Subscription(Closing):
             yield field
 
     async def __aiter__(self) -> AsyncIterator[FieldFrame]:
-        """Yield fields until the host closes; asynchronous version of :meth:`__iter__`."""
+        """Yield fields until the host or the subscription closes.
+
+        Asynchronous version of :meth:`__iter__`.
+        """
         while True:
             try:
                 field = await self.take_async(self._timeout_s)

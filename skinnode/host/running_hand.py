@@ -153,6 +153,7 @@ class RunningHand(ABC):
 
         Raises:
             KeyError: if there is no such patch.
+            ValueError: if ``deadline_s`` is negative, above 600 s or not a number.
             SkinError: if the patch cannot be tared.
         """
 

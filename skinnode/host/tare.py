@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from skinnode.errors import NodeTimeout
+from skinnode.config import HandConfig
+from skinnode.errors import NodeTimeout, SkinError
 from skinnode.host.health import PatchHealth
 from skinnode.host.remote_node import RemoteNode
 from skinnode.process import clock
@@ -21,11 +22,35 @@ TARE_DEADLINE_SYNCS: Final = 3
 the summary of the next scan.
 """
 
+_LONGEST_S: Final = 600.0
+"""Largest time limit (s) that a program may set. Larger values are probably milliseconds."""
+
 _POLL_S: Final = 0.005
 
 
+def tare_deadline_s(hand: HandConfig, deadline_s: float | None) -> float:
+    """Return the time limit (s) for a tare.
+
+    Args:
+        hand: Configuration of the hand.
+        deadline_s: Time limit (s) set by the program; None for the default.
+
+    Raises:
+        ValueError: if ``deadline_s`` is negative, above 600 s or not a number.
+    """
+    if deadline_s is None:
+        return TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * hand.sync.period_s
+    if not 0 <= deadline_s <= _LONGEST_S:
+        raise ValueError(f"deadline_s: got {deadline_s!r}, must be from 0 to {_LONGEST_S:g}")
+    return deadline_s
+
+
 def tare(
-    node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
+    node: RemoteNode,
+    baselines: Callable[[], int],
+    health: Callable[[], PatchHealth],
+    deadline_s: float,
+    cancelled: Callable[[], bool],
 ) -> None:
     """Tare a patch. Return as soon as the solver is using the new baseline.
 
@@ -34,10 +59,11 @@ def tare(
         baselines: Function that returns the number of new baselines that the host has read so far.
         health: Function that returns the current health of the patch.
         deadline_s: Time limit (s) for the new baseline.
+        cancelled: Function that returns True to end the wait for the new baseline.
 
     Raises:
         NodeTimeout: if the solver does not have a new baseline in time.
-        SkinError: for the reasons listed under :meth:`RemoteNode.tare`.
+        SkinError: if ``cancelled`` returned True, and for the reasons listed under :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies
     node.tare()
@@ -45,6 +71,9 @@ def tare(
     while baselines() == before or node.stream.withholding:
         if clock.monotonic() > end_s:
             raise NodeTimeout(node.patch.node_id, _why(node, health(), emergencies, deadline_s))
+        if cancelled():
+            where = f"patch {node.patch.name!r} on {node.patch.bus}"
+            raise SkinError(f"{where}: tare commanded, but the wait for the new baseline was cancelled")
         clock.sleep(_POLL_S)
 
 

@@ -25,7 +25,7 @@ class ScanStamp:
     patch: str
     """Name of the patch."""
     scan: int
-    """Number of the scan, counted from the start of the stream without wrap-around."""
+    """Number of the scan, counted from the start of the run without wrap-around."""
     counter: int
     """Scan number in the CAN frames, u8; equal to the SYNC counter if SYNC frames contain a counter."""
     device_time_us: int
@@ -40,11 +40,22 @@ class ScanStamp:
     """Time at which the last frame of the scan was received."""
     t_solved_ns: int = 0
     """Time at which the displacement field was ready; 0 if it is not ready yet."""
+    run: int = 0
+    """Number of restarts of a remote hand's daemon since the program connected; 0 in a host. Scan numbers
+    start again in each run.
+    """
 
     def solved_at(self, t_ns: int) -> ScanStamp:
         """Return a copy of the stamp with ``t_solved_ns`` set to ``t_ns``."""
         return ScanStamp(
-            self.patch, self.scan, self.counter, self.device_time_us, self.t_sync_ns, self.t_receive_ns, t_ns
+            self.patch,
+            self.scan,
+            self.counter,
+            self.device_time_us,
+            self.t_sync_ns,
+            self.t_receive_ns,
+            t_ns,
+            self.run,
         )
 
 

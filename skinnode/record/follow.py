@@ -51,11 +51,14 @@ def followed(recorder: Recorder, host: Host) -> Iterator[None]:
 
 
 def _watch(recorder: Recorder, host: Host, events: EventSubscription, over: threading.Event) -> None:
-    """Record each event immediately, and record the health every second and at the end."""
+    """Record each event immediately, and record the health every second and at the end.
+
+    The end is the end of the block or of the host, whichever comes first.
+    """
     due_s = clock.monotonic()
     ended = False
     while not ended:
-        ended = over.is_set()
+        ended = over.is_set() or events.ended
         now_s = clock.monotonic()
         if now_s >= due_s or ended:
             due_s = now_s + HEALTH_S

@@ -32,7 +32,7 @@ class PatchAccount:
 
     def __init__(self) -> None:
         self._received = self._lost = self._runs = self._sequence = 0
-        self._started_ns = -1
+        self._run: int | None = None
         self._delay_ns = 0
         self._t_receive_ns: int | None = None
         self.published = 0
@@ -40,15 +40,16 @@ class PatchAccount:
     def add(self, sent: SendStamp, delay_ns: int, t_receive_ns: int) -> bool:
         """Count a field; return whether it is newer than all earlier fields of its run.
 
+        A field with a different ``started_ns`` begins a new run. The order of ``started_ns`` has no meaning,
+        because the daemon's clock may have been set back.
+
         Args:
             sent: Sequence number and times of the field.
             delay_ns: Transit time, ns.
             t_receive_ns: Time at which the host received the scan, on this machine's monotonic clock, ns.
         """
-        if sent.started_ns != self._started_ns:
-            if sent.started_ns < self._started_ns:
-                return False  # a late message from an earlier run
-            self._started_ns, self._sequence = sent.started_ns, sent.sequence - 1
+        if sent.started_ns != self._run:
+            self._run, self._sequence = sent.started_ns, sent.sequence - 1
             self._runs += 1
         if sent.sequence <= self._sequence:
             return False

@@ -1,21 +1,20 @@
 """Executes programs' commands on a host, one at a time, in a separate thread.
 
-A request is JSON with ``command`` (``tare`` or ``reset_node``), ``patch`` and, for a tare, ``deadline_s``.
-The reply is empty, or an error as JSON with ``kind``, ``node_id`` and ``text``.
+The reply to a request (:class:`skinnode.remote.commands.Request`) is empty, or an error as JSON.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from skinnode.errors import NodeError, NodeTimeout, SkinError
+from skinnode.errors import SkinError
 from skinnode.host import Host
-from skinnode.host.containment import one_line
+from skinnode.host.tare import tare_deadline_s
 from skinnode.process import clock
 from skinnode.remote import keys
+from skinnode.remote.commands import REPLY_S, Request, encoded
 
 if TYPE_CHECKING:
     import zenoh
@@ -26,8 +25,17 @@ _WAITING: Final = 16
 """Maximum number of queued commands; the daemon refuses further commands."""
 
 
+class _Arrival(NamedTuple):
+    query: zenoh.Query
+    t_ns: int
+    """Monotonic time at which the command arrived, ns."""
+
+
 class CommandServer:
     """Accepts commands from construction until :meth:`close`.
+
+    A program gives up a command :data:`~skinnode.remote.commands.REPLY_S` after the command's time limit. A
+    command whose turn comes too late is refused, so no command is executed that its program has given up.
 
     Args:
         session: Session of the daemon.
@@ -36,14 +44,22 @@ class CommandServer:
 
     def __init__(self, session: zenoh.Session, host: Host) -> None:
         self._host, self._key = host, keys.command_key(host.hand.name)
-        self._waiting: queue.SimpleQueue[zenoh.Query | None] = clock.simple_queue()
+        self._waiting: queue.SimpleQueue[_Arrival | None] = clock.simple_queue()
+        self._over = clock.event()
         self._thread = clock.thread(target=self._run, name="remote commands")
         self._thread.start()
-        self._queryable = session.declare_queryable(self._key, self._accept)
+        self._queryable: zenoh.Queryable[None] | None = session.declare_queryable(self._key, self._accept)
 
     def close(self) -> None:
-        """Stop accepting commands and wait for the command in progress to finish."""
-        self._queryable.undeclare()
+        """Refuse the queued commands, stop waiting for the current one, and wait for the thread to end.
+
+        Further calls have no effect.
+        """
+        queryable, self._queryable = self._queryable, None
+        if queryable is None:
+            return
+        self._over.set()
+        queryable.undeclare()
         self._waiting.put(None)
         self._thread.join()
 
@@ -51,45 +67,36 @@ class CommandServer:
         """Queue a command. Called by a Zenoh thread, which must not block."""
         if self._waiting.qsize() >= _WAITING:
             with query:
-                query.reply_err(_error(SkinError(f"{_WAITING} commands are waiting; try again later")))
+                query.reply_err(encoded(SkinError(f"{_WAITING} commands are waiting; try again later")))
             return
-        self._waiting.put(query)
+        self._waiting.put(_Arrival(query, clock.monotonic_ns()))
 
     def _run(self) -> None:
-        while (query := self._waiting.get()) is not None:
+        while (arrival := self._waiting.get()) is not None:
+            query = arrival.query
             with query:
                 try:
-                    self._execute(b"" if query.payload is None else query.payload.to_bytes())
+                    self._execute(b"" if query.payload is None else query.payload.to_bytes(), arrival.t_ns)
                 except Exception as error:  # the program receives the error; the daemon continues
-                    query.reply_err(_error(error))
+                    query.reply_err(encoded(error))
                 else:
                     query.reply(self._key, b"")
 
-    def _execute(self, request: bytes) -> None:
-        try:
-            table = json.loads(request)
-            command, patch = table["command"], str(table["patch"])
-            deadline_s = None if table.get("deadline_s") is None else float(table["deadline_s"])
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise SkinError(f"request: got {request[:40]!r}, must be JSON with command and patch") from None
+    def _execute(self, data: bytes, arrived_ns: int) -> None:
+        request = Request.decode(data)
+        command, patch = request.command, request.patch
+        if command not in ("tare", "reset_node"):
+            raise SkinError(f"command: got {command!r}, must be tare or reset_node")
         if patch not in {each.name for each in self._host.hand.patches}:
             raise SkinError(f"patch: got {patch!r}, but the hand has no such patch")
+        deadline_s = tare_deadline_s(self._host.hand, request.deadline_s)
+        left_s = deadline_s + REPLY_S / 2 - request.waited_s(arrived_ns)
+        if self._over.is_set():
+            raise SkinError(f"{command} of {patch!r} not executed: the daemon is ending")
+        if left_s < 0:
+            raise SkinError(f"{command} of {patch!r} not executed: its turn came too late; try again")
         _log.info("%s: %s, commanded by a program", patch, command)
-        match command:
-            case "tare":
-                self._host.tare(patch, deadline_s=deadline_s)
-            case "reset_node":
-                self._host.reset_node(patch)
-            case _:
-                raise SkinError(f"command: got {command!r}, must be tare or reset_node")
-
-
-def _error(error: Exception) -> bytes:
-    table: dict[str, Any] = {"kind": "SkinError", "text": str(error)}
-    if isinstance(error, NodeError):
-        table["kind"] = "NodeTimeout" if isinstance(error, NodeTimeout) else "NodeError"
-        table["node_id"] = error.node_id
-        table["text"] = str(error).removeprefix(f"node {error.node_id}: ")
-    elif not isinstance(error, SkinError):
-        table["text"] = one_line(error)
-    return json.dumps(table).encode()
+        if command == "tare":
+            self._host.tare(patch, deadline_s=min(deadline_s, left_s), cancelled=self._over.is_set)
+        else:
+            self._host.reset_node(patch)

@@ -41,6 +41,15 @@ class Description:
     """Boot ID of the daemon's operating system. Processes with the same boot ID share a monotonic clock."""
     commands: bool
     """Whether the daemon accepts commands."""
+    started_ns: int
+    """Time since 1970 at which the daemon started, ns; identifies its run, as in its fields and reports."""
+
+    def agrees_with(self, other: Description) -> bool:
+        """Return whether both descriptions have the same configuration and the same electrodes."""
+        hashes, others = (
+            {name: layout.layout_hash for name, layout in each.layouts.items()} for each in (self, other)
+        )
+        return hashes == others and self.hand.model_dump() == other.hand.model_dump()
 
     def encode(self) -> bytes:
         """Encode the description as JSON."""
@@ -59,6 +68,7 @@ class Description:
             "layouts": layouts,
             "boot_id": self.boot_id,
             "commands": self.commands,
+            "started_ns": self.started_ns,
         }
         return json.dumps(table).encode()
 
@@ -84,7 +94,13 @@ class Description:
                     )
             header, _, _ = parse_journal(f"hand {hand!r}", "description", [table["header"].encode()])
             layouts = {name: _layout(each) for name, each in table["layouts"].items()}
-            return cls(header.hand, layouts, str(table["boot_id"]), bool(table["commands"]))
+            return cls(
+                header.hand,
+                layouts,
+                str(table["boot_id"]),
+                bool(table["commands"]),
+                int(table["started_ns"]),
+            )
         except ConfigError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:

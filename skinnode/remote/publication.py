@@ -73,7 +73,7 @@ class Publication(Closing):
         self._outputs = Outputs(self._session, HandTopics.of(host.hand))
         self._fields = host.fields(capacity=QUEUED * len(self._patches))
         self._over = clock.event()
-        self._description = self._describe(commands=commands)
+        self._description: zenoh.Queryable[None] | None = self._describe(commands=commands)
         self._commands = CommandServer(self._session, host) if commands else None
         self._status = StatusPublication(host, self._outputs, self._started_ns, self.stats, self._defects)
         self._thread = clock.thread(target=self._run, name="publish")
@@ -84,20 +84,23 @@ class Publication(Closing):
         return PublicationStats(dict(self._published), self._fields.dropped, self._defects.count)
 
     def close(self) -> None:
-        """Stop publishing and wait for the threads to end."""
+        """Stop publishing and wait for the threads to end. Further calls have no effect."""
         self._over.set()
         self._thread.join()
         self._status.close()
         self._fields.close()
         if self._commands is not None:
             self._commands.close()
-        self._description.undeclare()
+        description, self._description = self._description, None
+        if description is not None:
+            description.undeclare()
 
     def _describe(self, *, commands: bool) -> zenoh.Queryable[None]:
         """Answer queries for the hand's description."""
         hand = self._host.hand
         layouts = {name: self._host.layout(name) for name in self._patches}
-        key, data = keys.description_key(hand.name), Description(hand, layouts, boot_id(), commands).encode()
+        description = Description(hand, layouts, boot_id(), commands, self._started_ns)
+        key, data = keys.description_key(hand.name), description.encode()
 
         def answer(query: zenoh.Query) -> None:
             with query:

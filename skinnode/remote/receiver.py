@@ -40,7 +40,7 @@ class Recipients:
     report: Callable[[HealthReport], None]
     event: Callable[[HealthEvent], None]
     on_turn: Callable[[], None]
-    """Called between messages."""
+    """Called after each message, and at least every :data:`TURN_S`."""
 
 
 class _Item(NamedTuple):
@@ -52,7 +52,7 @@ class _Item(NamedTuple):
 
 
 class Receiver:
-    """Thread that receives messages from construction until :meth:`close`.
+    """Queues messages from construction; from :meth:`start` until :meth:`close`, a thread passes them on.
 
     Args:
         session: Session of the program.
@@ -66,7 +66,8 @@ class Receiver:
     ) -> None:
         hand = description.hand
         self._recipients, self._defects = recipients, defects
-        self._same_clock = description.boot_id == boot_id() != ""
+        self._boot_id = boot_id()
+        self.follow(description, run=0)
         self._inbox: DropOldestQueue[_Item] = DropOldestQueue(QUEUED * len(hand.patches))
         self._events_of: tuple[bytes, int] | None = None
         self.dropped = 0
@@ -74,7 +75,6 @@ class Receiver:
         self.events_lost = 0
         """Number of events that the daemon sent but that did not arrive."""
         self._thread = clock.thread(target=self._run, name="receive")
-        self._thread.start()
         topics = HandTopics.of(hand)
         wanted = [(topic.full_field, FIELD) for topic in topics.patches.values()]
         wanted += [(topics.health, HEALTH_REPORT), (topics.events, LOG)]
@@ -83,9 +83,23 @@ class Receiver:
             for topic, message in wanted
         ]
 
+    def start(self) -> None:
+        """Start to pass on messages."""
+        self._thread.start()
+
+    def follow(self, description: Description, run: int) -> None:
+        """Stamp the next fields as fields of the daemon that sent ``description``.
+
+        Args:
+            description: Description, whose boot ID determines how times are converted.
+            run: Number of the daemon's run, for the stamps.
+        """
+        self._run_number, self._same_clock = run, description.boot_id == self._boot_id != ""
+
     def close(self) -> None:
-        """Stop receiving and wait for the thread to end."""
-        for subscriber in self._subscribers:
+        """Stop receiving and wait for the thread to end. Further calls have no effect."""
+        subscribers, self._subscribers = self._subscribers, []
+        for subscriber in subscribers:
             subscriber.undeclare()
         self._inbox.put(End())
         self._thread.join()
@@ -106,20 +120,27 @@ class Receiver:
         keep_on(self._turn, self._defects, "receiving")
 
     def _turn(self) -> bool:
-        self._recipients.on_turn()
+        item: _Item | End | None
         try:
             item = self._inbox.get(TURN_S)
         except queue.Empty:
-            return True
-        if isinstance(item, End):
+            item = None
+        if isinstance(item, End):  # ends the thread, even if every turn raises an exception
             return False
+        try:
+            if item is not None:
+                self._pass_on(item)
+        finally:
+            self._recipients.on_turn()
+        return True
+
+    def _pass_on(self, item: _Item) -> None:
         if item.message == FIELD:
             self._field(item)
         elif item.message == LOG:
             self._event(item)
         else:
             self._recipients.report(decode_report(item.data))
-        return True
 
     def _field(self, item: _Item) -> None:
         field, sent = decode_field(item.data)
@@ -130,6 +151,7 @@ class Receiver:
             t_sync_ns=stamp.t_sync_ns and stamp.t_sync_ns + offset_ns,
             t_receive_ns=stamp.t_receive_ns + offset_ns,
             t_solved_ns=stamp.t_solved_ns and stamp.t_solved_ns + offset_ns,
+            run=self._run_number,
         )
         self._recipients.field(sealed(field, stamp=local), sent, item.t_ns - sent.sent_ns)
 

@@ -13,7 +13,7 @@ from skinnode.host.events import Events, HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.publish import Publisher
 from skinnode.host.running_hand import RunningHand
-from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS
+from skinnode.host.tare import tare_deadline_s
 from skinnode.messages.full_field import SendStamp
 from skinnode.messages.health_report import HealthReport
 from skinnode.model.frames import FieldFrame
@@ -33,6 +33,8 @@ SILENT_S: Final = 1.0
 """Time without a health report after which the daemon is considered silent, s. The daemon sends four reports
 per second."""
 _RESET_S: Final = 1.0
+_UNKNOWN: Final = -1
+"""Number of arrivals after which the next turn requests a description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,9 @@ class RemoteHand(RunningHand, Closing):
 
     If the daemon ends or the connection fails, subscriptions wait, :meth:`health` reports every patch as lost
     with the reason, and :attr:`away` gives the reason. The connection is re-established in the background.
+    Only data of the run whose description has arrived are passed on. If a returning daemon has another hand
+    file, or a version of skinnode with different messages, its data are never passed on: subscriptions raise
+    an error, and the hand remains away.
 
     Threads: any thread may call any method.
 
@@ -73,10 +78,13 @@ class RemoteHand(RunningHand, Closing):
         self._report: HealthReport | None = None
         self._t_report_ns = clock.monotonic_ns()
         self._was_away: bool | None = None
+        self._run = 0
+        self._refusal: SkinError | None = None
         self._watch = DaemonWatch(session, self.hand.name)
         self._described = self._watch.arrivals
-        recipients = Recipients(self._on_field, self._on_report, self._events.publish, self._on_turn)
+        recipients = Recipients(self._on_field, self._on_report, self._on_event, self._on_turn)
         self._receiver = Receiver(session, description, recipients, self._defects)
+        self._receiver.start()
 
     # --- the same interface as a host
 
@@ -120,12 +128,11 @@ class RemoteHand(RunningHand, Closing):
 
         Raises:
             KeyError: if there is no such patch.
+            ValueError: if ``deadline_s`` is negative, above 600 s or not a number.
             NodeError: if the host raises it.
             SkinError: if the daemon does not accept commands or does not reply in time.
         """
-        default_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
-        request: dict[str, object] = {"command": "tare", "patch": patch, "deadline_s": deadline_s}
-        self._command(request, default_s if deadline_s is None else deadline_s)
+        self._command("tare", patch, tare_deadline_s(self.hand, deadline_s))
 
     def reset_node(self, patch: str) -> None:
         """Reset a patch's node; see :meth:`skinnode.Host.reset_node`.
@@ -135,20 +142,20 @@ class RemoteHand(RunningHand, Closing):
             NodeError: if the host raises it.
             SkinError: if the daemon does not accept commands or does not reply in time.
         """
-        self._command({"command": "reset_node", "patch": patch}, _RESET_S)
+        self._command("reset_node", patch, _RESET_S)
 
     # --- the connection
 
     @property
     def away(self) -> str | None:
         """Reason why no data is arriving; None while the daemon is present and sending."""
-        now_ns = clock.monotonic_ns()
-        silent_s = (now_ns - self._t_report_ns) * 1e-9
+        if self._refusal is not None:
+            return str(self._refusal)
         if not self._watch.present:
-            since_s = (now_ns - self._watch.t_change_ns) * 1e-9
+            since_s = (clock.monotonic_ns() - self._watch.t_change_ns) * 1e-9
             return f"no daemon has published hand {self.hand.name!r} for {since_s:.1f} s"
-        if silent_s > SILENT_S:
-            return f"the daemon of hand {self.hand.name!r} has sent nothing for {silent_s:.1f} s"
+        if self._silent_s > SILENT_S:
+            return f"the daemon of hand {self.hand.name!r} has sent nothing for {self._silent_s:.1f} s"
         return None
 
     @property
@@ -161,7 +168,13 @@ class RemoteHand(RunningHand, Closing):
 
     @property
     def ready(self) -> bool:
-        """Whether the first health report has arrived."""
+        """Whether the first health report has arrived.
+
+        Raises:
+            SkinError: if the daemon has restarted, and its data are not passed on.
+        """
+        if self._refusal is not None:
+            raise self._refusal
         return self._report is not None
 
     def stats(self) -> RemoteStats:
@@ -176,31 +189,38 @@ class RemoteHand(RunningHand, Closing):
         )
 
     def close(self) -> None:
-        """End all subscriptions, the thread and the session."""
+        """End all subscriptions, the thread and the session. Further calls have no effect."""
         self._receiver.close()
         self._session.close()
         self._publisher.end()
         self._events.end()
         self._callbacks.join()
 
-    def _command(self, request: dict[str, object], deadline_s: float) -> None:
-        patch = str(request["patch"])
+    def _command(self, command: str, patch: str, deadline_s: float) -> None:
         if patch not in self._accounts:
             raise KeyError(patch)
         for refusal in (self.no_commands, self.away):
             if refusal is not None:
                 raise SkinError(refusal)
-        commands.send(self._session, self.hand.name, request, deadline_s)
+        commands.send(self._session, self.hand.name, commands.Request(command, patch, deadline_s))
 
     # --- the receiver's thread
 
     def _on_field(self, field: FieldFrame, sent: SendStamp, delay_ns: int) -> None:
         stamp = field.stamp
         assert stamp is not None
+        if not self._is_current(sent.started_ns):
+            return
         if self._accounts[stamp.patch].add(sent, delay_ns, stamp.t_receive_ns):
             self._publisher.publish(field, stamp.patch)
 
+    def _on_event(self, event: HealthEvent) -> None:
+        if self._refusal is None:
+            self._events.publish(event)
+
     def _on_report(self, report: HealthReport) -> None:
+        if not self._is_current(report.started_ns):
+            return
         buses = {bus.name for bus in self.hand.served_buses}
         if set(report.patches) != set(self._accounts) or set(report.buses) != buses:
             raise ValueError("a health report for another hand")
@@ -210,9 +230,15 @@ class RemoteHand(RunningHand, Closing):
 
     def _on_turn(self) -> None:
         """Publish an event when the daemon disappears or returns; read a new daemon's description."""
-        if self._watch.arrivals != self._described:
-            arrivals = self._watch.arrivals
-            description = ask(self._session, self.hand.name)
+        if self._refusal is not None:
+            return
+        arrivals = self._watch.arrivals
+        if arrivals != self._described:
+            try:
+                description = ask(self._session, self.hand.name)
+            except SkinError as error:
+                self._refuse(error)
+                return
             if description is not None:  # otherwise the daemon is starting: ask again
                 self._described = arrivals
                 self._take(description)
@@ -224,8 +250,33 @@ class RemoteHand(RunningHand, Closing):
         self._events.publish(HealthEvent(clock.monotonic_ns(), "host", what, text))
 
     def _take(self, description: Description) -> None:
-        if description.hand.model_dump() != self.hand.model_dump():
+        if not description.agrees_with(self._description):
             text = "its daemon has restarted with another hand file; connect again"
-            self._publisher.fail(SkinError(f"hand {self.hand.name!r}: {text}"))
+            self._refuse(SkinError(f"hand {self.hand.name!r}: {text}"))
             return
+        self._run += description.started_ns != self._description.started_ns
         self._description = description
+        self._receiver.follow(description, self._run)
+
+    def _refuse(self, error: SkinError) -> None:
+        """Pass on nothing from now on, and give ``error`` as the reason wherever a program may look."""
+        self._refusal, self._was_away = error, True
+        self._publisher.fail(error)
+        self._events.publish(HealthEvent(clock.monotonic_ns(), "host", "away", str(error)))
+
+    def _is_current(self, started_ns: int) -> bool:
+        """Return whether a message is from the run that has been described.
+
+        If another run sends while the described one is silent, its description is requested: a daemon that is
+        about to end may have answered the previous request.
+        """
+        if self._refusal is None and started_ns == self._description.started_ns:
+            return True
+        if self._silent_s > SILENT_S:
+            self._described = _UNKNOWN
+        return False
+
+    @property
+    def _silent_s(self) -> float:
+        """Time since the newest report of the described run, s."""
+        return (clock.monotonic_ns() - self._t_report_ns) * 1e-9

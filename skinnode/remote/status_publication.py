@@ -39,7 +39,7 @@ class Counters(Protocol):
 
 
 class StatusPublication:
-    """Thread that publishes from construction until :meth:`close`.
+    """Thread that publishes from construction until :meth:`close` or until the host closes.
 
     Args:
         host: Running host.
@@ -69,7 +69,7 @@ class StatusPublication:
         self._thread.start()
 
     def close(self) -> None:
-        """Send the pending events and wait for the thread to end."""
+        """Send the pending events and wait for the thread to end. Further calls have no effect."""
         self._over.set()
         self._thread.join()
 
@@ -81,7 +81,7 @@ class StatusPublication:
         event = self._events.get(0.0 if ending else _POLL_S)
         if event is not None:
             self._send_event(event)
-        if ending:
+        if ending or self._events.ended:
             return event is not None
         if clock.monotonic() >= self._due_s:
             self._due_s = clock.monotonic() + HEALTH_S

@@ -178,7 +178,9 @@ def test_a_subscriber_that_lags_loses_the_oldest_events() -> None:
     assert [text for _, _, text in reported(slow)] == ["3", "4"]
     assert (slow.dropped, quick.dropped) == (3, 0)
     events.end()
+    assert not quick.ended
     assert [event.text for event in quick] == ["0", "1", "2", "3", "4"]
+    assert quick.ended  # so a loop that polls with get() can end
     assert list(quick) == list(events.subscribe(1)) == []
 
 

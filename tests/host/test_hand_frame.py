@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import itertools
+import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 from skinnode.config import HandConfig, parse_hand
 from skinnode.host import Condition, HandFrame, Host
 from skinnode.host.hand_frame import LATE, OVERTAKEN, HandGatherer, HandSubscription
+from skinnode.host.publish import Publisher
 from skinnode.host.skeleton import Skeleton
 from skinnode.model.frames import Contact, FieldFrame, ScanStamp, SolveStats
 from skinnode.model.pose import Pose
@@ -30,9 +33,9 @@ MS = 1_000_000
 PATIENCE = 50 * MS
 
 
-def field(patch: str, scan: int) -> FieldFrame:
+def field(patch: str, scan: int, run: int = 0) -> FieldFrame:
     zero = np.zeros((1, 1, 3))
-    stamp = ScanStamp(patch, scan, scan % 240, 0, 1000 * scan, 0, 0)
+    stamp = ScanStamp(patch, scan, scan % 240, 0, 1000 * scan, 0, 0, run)
     return FieldFrame(zero, zero, (), np.zeros(1), SolveStats(0, 0, 0, 0.0), stamp=stamp)
 
 
@@ -65,6 +68,53 @@ def test_a_patch_that_skipped_a_scan_is_not_waited_for() -> None:
     frame = hand.next(1)
     assert frame is not None
     assert (numbers(frame), frame.missing, frame.complete) == ({"a": 1}, {"b": OVERTAKEN}, False)
+
+
+def test_scan_numbers_start_again_in_each_run() -> None:
+    hand = gatherer("a", "b")
+    for scan in range(1, 101):
+        hand.add(field("a", scan), scan)
+        hand.add(field("b", scan), scan)
+        assert numbers(hand.next(scan)) == {"a": scan, "b": scan}
+    hand.add(field("a", 101), 101)  # the last field of the first run
+    hand.add(field("a", 1, run=1), 102)
+    assert hand.next(102) is None  # b could still deliver scan 101
+    hand.add(field("b", 1, run=1), 103)
+    last, first = hand.next(103), hand.next(103)
+    assert last is not None
+    assert (numbers(last), last.missing) == ({"a": 101}, {"b": OVERTAKEN})
+    assert first is not None
+    assert (first.scan, numbers(first), first.complete) == (1, {"a": 1, "b": 1}, True)
+    assert hand.late == 0
+
+
+def test_a_frame_has_the_fields_of_one_run() -> None:
+    hand = gatherer("a", "b")
+    hand.add(field("a", 7), 0)
+    hand.add(field("b", 7, run=1), 1)
+    frame = hand.next(PATIENCE)
+    assert numbers(frame) == {"a": 7}
+
+
+@pytest.mark.system_time
+@pytest.mark.parametrize("read", ["get", "for", "async for"])
+def test_closing_a_subscription_ends_its_waiting_reader(read: str) -> None:
+    publisher = Publisher(("a",))
+    hands = HandSubscription(publisher.subscribe(8, None, None), gatherer("a"), None)
+
+    async def follow() -> list[HandFrame]:
+        return [frame async for frame in hands]
+
+    waits = {"get": hands.get, "for": lambda: list(hands), "async for": lambda: asyncio.run(follow())}[read]
+    reader = threading.Thread(target=waits, daemon=True)
+    reader.start()
+    reader.join(0.1)
+    assert reader.is_alive()
+    hands.close()
+    reader.join(10.0)
+    assert not reader.is_alive()
+    hands.close()
+    assert hands.get() is None
 
 
 def test_after_the_patience_it_goes_on_and_who_comes_then_is_late() -> None:

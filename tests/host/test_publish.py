@@ -90,6 +90,16 @@ def test_closed_and_forgotten_subscriptions_get_nothing(publisher: Publisher) ->
     assert len(publisher._subscriptions) == 0  # that memory does not grow cannot be seen from outside
 
 
+def test_closing_a_subscription_ends_its_loop_after_the_queued_fields(publisher: Publisher) -> None:
+    fields = publisher.subscribe(10, None, None)
+    publisher.publish(field(1), "left")
+    fields.close()
+    publisher.publish(field(2), "left")
+    fields.close()
+    assert numbers(list(fields)) == [1]
+    assert fields.get() is None
+
+
 @pytest.mark.parametrize(
     ("capacity", "patch", "message"),
     [

@@ -196,12 +196,16 @@ def test_a_callback_that_never_returns_does_not_keep_the_host(
     assert eventually(lambda: callback.ended)
 
 
-def test_a_failure_of_the_host_ends_callbacks(publisher: Publisher) -> None:
+def test_a_failure_of_the_host_ends_callbacks_with_a_warning(
+    publisher: Publisher, caplog: pytest.LogCaptureFixture
+) -> None:
     from skinnode.host.callback import FieldCallback
 
     callback = FieldCallback(lambda one: None, publisher.subscribe(10, None, None))
     publisher.fail(BusError("gone"))
     assert eventually(lambda: callback.ended)
+    warnings = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.WARNING]
+    assert [text.endswith("is not called any more: gone") for text in warnings] == [True]
 
 
 @pytest.mark.parametrize("boot_deadline_s", [float("nan"), float("inf"), -1.0])

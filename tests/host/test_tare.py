@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skinnode.config import HandConfig
-from skinnode.errors import NodeError, NodeTimeout
+from skinnode.errors import NodeError, NodeTimeout, SkinError
 from skinnode.host import Host
 from skinnode.host.configurator import Configurator
 from skinnode.record import Recorder
@@ -129,6 +129,23 @@ def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
         host.tare("p0")  # the patch is faulty meanwhile, and brought up again
         assert len(calls) == 2
         assert host.health("p0").baselines == 1
+
+
+@pytest.mark.parametrize("deadline_s", [float("nan"), float("inf"), -1.0, 5000.0])
+def test_a_time_limit_that_is_none_is_refused_before_the_tare(
+    hand: HandConfig, rack: Rack, deadline_s: float
+) -> None:
+    with Host.from_config(hand) as host:
+        with pytest.raises(ValueError, match=r"deadline_s: got .*, must be from 0 to 600"):
+            host.tare("p0", deadline_s=deadline_s)
+        assert host.health("p0").baselines == 0
+
+
+def test_a_tare_can_be_cancelled(hand: HandConfig, rack: Rack) -> None:
+    with Host.from_config(hand) as host:
+        rack.pull("p0")  # its last heartbeat still counts
+        with pytest.raises(SkinError, match=r"patch 'p0' on can0: tare commanded, but .* was cancelled"):
+            host.tare("p0", deadline_s=60.0, cancelled=lambda: True)
 
 
 def test_a_tare_that_the_node_does_not_take_is_a_timeout(hand: HandConfig, rack: Rack) -> None:

@@ -10,6 +10,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -72,6 +73,17 @@ def run(
         if stats.fields == len(list(replay(path))):  # with the scans that ended while the host closed
             return path, hand, live
     raise AssertionError("no recording holds a field for each of its scans")
+
+
+def test_the_recording_of_the_health_ends_with_the_host(tmp_path: Path) -> None:
+    hand, path = a_hand(), tmp_path / "run.mcap"
+    with Fleet(hand), Recorder(hand, path) as recorder, contextlib.ExitStack() as block:
+        with Host.from_config(hand, tap=recorder) as host:
+            block.enter_context(followed(recorder, host))
+        end_s = time.monotonic() + 30.0
+        while any(each.name == "record health" for each in threading.enumerate()):
+            assert time.monotonic() < end_s  # until then, the thread would poll without a pause
+            time.sleep(0.01)
 
 
 def chunks_in(data: bytes) -> list[int]:

@@ -149,15 +149,18 @@ def test_a_hand_has_one_daemon(start: Callable[..., Process], name: str, said: s
     assert text.count("\n") == 1
 
 
-@pytest.mark.long
-def test_a_daemon_with_another_hand_file_is_refused(start: Callable[..., Process], port: int) -> None:
-    first = start().wait_until_up()
-    with sk.connect("hand", port=port) as hand:
-        fields = hand.fields()
-        first.kill()
-        start(patches=3).wait_until_up()
-        with pytest.raises(SkinError, match=r"another hand file; connect again"):
-            list(fields)
+def test_an_interrupted_connect_leaves_nothing_open(
+    start: Callable[..., Process], port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(hand: sk.RemoteHand) -> bool:
+        raise KeyboardInterrupt
+
+    start().wait_until_up()
+    threads = own_threads()
+    monkeypatch.setattr(sk.RemoteHand, "ready", property(interrupted))  # Ctrl-C before the first report
+    with pytest.raises(KeyboardInterrupt):
+        sk.connect("hand", port=port)
+    assert own_threads() == threads
 
 
 def test_messages_that_are_none_harm_nobody(start: Callable[..., Process], port: int) -> None:

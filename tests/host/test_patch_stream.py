@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.config import HandConfig
+from skinnode.config import HandConfig, PatchConfig
 from skinnode.errors import SkinError
 from skinnode.host.code_watch import Verdict
 from skinnode.host.containment import Defects
@@ -332,6 +332,36 @@ def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
     assert (field.stamp.t_receive_ns, field.stamp.t_solved_ns) == (MS, 7 * MS)
     expected = Tracker(LAYOUT, method=method, baseline_ohm=REST_OHM).update(pressed_ohm)
     np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=1e-6)
+
+
+def test_drift_while_sync_pauses_is_no_touch(
+    make_hand: Callable[..., HandConfig], publisher: Publisher, ticks: Ticks
+) -> None:
+    """For eight hours, in which the skin cools down, so that all resistances rise by 2 %."""
+    hand, rng = make_hand(1), np.random.default_rng(5)
+    ordinary = PatchConfig(name="thumb", node_id=5).tolerances  # a drift of 2 % contradicts exact ones
+    patch = hand.patches[0].model_copy(update={"relative_noise": 1e-3, "tolerances": ordinary})
+    facts = NodeFacts(patch, LAYOUT, PROFILE, CodeScale(), REST_OHM, None, 0.25)
+    stream = PatchStream(
+        "thumb",
+        ScanAssembler(PROFILE, counter_overflow=240),
+        StreamOutput(Inline(), publisher),
+        StreamOptions(ticks.find),
+    )
+    stream.resume(ScanSolver(facts, hand.solver), 0, anew=True)
+    fields, touched = publisher.subscribe(10, 10.0, None), []
+    for number in range(1, 61):
+        paused = number > 30
+        ohm = REST_OHM * (1.02 if paused else 1.0) * (1.0 + 1e-3 * rng.standard_normal(LAYOUT.shape))
+        t_ns = (number * 80 + paused * 8 * 3_600_000) * MS
+        chunks = pack_scan(encode(ohm, REST_OHM, CodeScale()), number, PROFILE)
+        for chunk in chunks:
+            stream.on_chunk(chunk, t_ns)
+        stream.on_summary(pack_summary(number, SummaryFlag(0), len(chunks), 1000), t_ns)
+        field = fields.get(0)
+        assert field is not None
+        touched.append(field.touched)
+    assert touched == [False] * 60
 
 
 def test_scans_from_many_turns_are_all_accounted_for(

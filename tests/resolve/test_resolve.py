@@ -316,7 +316,7 @@ def test_a_command_killed_at_any_rename_of_its_result_continues(
 
 
 def test_results_of_long_settings_have_different_names(recording: Path, tmp_path: Path) -> None:
-    gains = [f"[{', '.join(['1.000000000000001'] * 3)}, {last}]" for last in ("1.0", "1.1")]
+    gains = [f"[{', '.join(['1.000000000000000000000000000000001'] * 3)}, {last}]" for last in ("1.0", "1.1")]
     chosen = variants([f"patches.p0.calibration.upper_gain={','.join(gains)}"])
     jobs = make_plan([recording_at(recording, None)], chosen, tmp_path, ".parquet", 1)
     assert len({job.write.target for job in jobs}) == 2
@@ -351,17 +351,14 @@ def test_a_killed_command_continues_where_it_was(recording: Path, tmp_path: Path
 
 
 def test_unknown_deviations_do_not_lower_the_mean(recording: Path, tmp_path: Path) -> None:
-    """In the second half, three quarters of the PDOs are missing; most wires cannot be solved."""
+    """In the second half of the recording, all chunks are missing."""
     lossy = tmp_path / "lossy.log"
     lines = recording.read_text().splitlines(keepends=True)
-    ids = [int(line.split()[2].partition("#")[0], 16) for line in lines]
-    lossy.write_text("".join(
-        line for n, (line, cob_id) in enumerate(zip(lines, ids, strict=True))
-        if n < len(lines) // 2 or n % 4 == 0 or not 0x180 <= cob_id < 0x580
-    ))  # fmt: skip
+    middle = len(lines) // 2
+    kept = [line for line in lines[middle:] if not line.split()[2].startswith(("185#", "186#", "187#"))]
+    lossy.write_text("".join(lines[:middle] + kept))
     lossy.with_suffix(".jsonl").write_bytes(recording.with_suffix(".jsonl").read_bytes())
-    setting = "solver.method=exact"
-    (result,) = resolve(lossy, "-o", tmp_path, "--set", setting, "--processes", 1, status=1)
+    (result,) = resolve(lossy, "-o", tmp_path, "--processes", 1, status=1)
     table = pq.read_table(result["file"]).to_pylist()
     medians = np.array([np.median(np.array(row["displacement_std_m"]).reshape(-1, 3)[:, 2]) for row in table])
     known = np.isfinite(medians)

@@ -38,6 +38,9 @@ class FrameCounter:
         with self._counting:
             self.sent_on[bus][kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
+    def numbered(self, bus: str, t_ns: int, number: int) -> None:
+        """Count nothing."""
+
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Count nothing."""
 

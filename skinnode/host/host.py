@@ -235,7 +235,7 @@ class Host(RunningHand):
         ends, tap = [], ContainedTap(tap, self._defects)
         for bus in self._buses.values():
             streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
-            ends.append(tap_bus(tap, bus.link, streams))
+            ends.append(tap_bus(tap, bus.link, bus.ticks, streams))
 
         def untap() -> None:
             for end in ends:

@@ -154,7 +154,7 @@ def _remote_nodes(
 
 def _tap_all(tap: ContainedTap, buses: Iterable[ServedBus], nodes: Iterable[RemoteNode]) -> None:
     for bus in buses:
-        tap_link(tap, bus.link)
+        tap_link(tap, bus.link, bus.ticks)
     for node in nodes:
         node.stream.tap = tap
 

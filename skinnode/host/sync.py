@@ -53,10 +53,14 @@ class Ticks:
 
     def note(self, number: int, t_ns: int) -> int:
         """Store the time of SYNC ``number``. Return its counter (1 to ``counter_overflow``)."""
-        counter = (number - 1) % self.counter_overflow + 1
+        counter = self.counter_of(number)
         self._ticks[counter] = Tick(number, t_ns)
         self.newest = number
         return counter
+
+    def counter_of(self, number: int) -> int:
+        """Return the counter of SYNC ``number``."""
+        return (number - 1) % self.counter_overflow + 1
 
     def find(self, counter: int) -> Tick | None:
         """Return the newest SYNC with this counter value; None if there has been none."""
@@ -64,17 +68,10 @@ class Ticks:
 
 
 class SyncFollower:
-    """Follower of a producer's SYNC; stores the SYNC times in ``ticks``. Used only by the mainline.
+    """Follower of another producer's SYNC; stores the SYNC times in ``ticks``. Used only by the mainline."""
 
-    Args:
-        ticks: Record of the SYNC times.
-        period_s: SYNC period (s) of a producer that counts on while its SYNC messages are lost: the time that
-            has elapsed then shows how often the counter has wrapped. If None, it is assumed not to have
-            wrapped.
-    """
-
-    def __init__(self, ticks: Ticks, period_s: float | None = None) -> None:
-        self._ticks, self._period_s = ticks, period_s
+    def __init__(self, ticks: Ticks) -> None:
+        self._ticks = ticks
         self.received = self.irregular = 0
         self.t_newest_ns = 0
         """Monotonic time (ns) of the newest SYNC; 0 before the first one."""
@@ -82,7 +79,7 @@ class SyncFollower:
     def on_sync(self, data: bytes, t_ns: int) -> None:
         """Process a received SYNC. A SYNC without a valid counter is counted but not stored."""
         self.received += 1
-        elapsed_s, self.t_newest_ns = (t_ns - self.t_newest_ns) * 1e-9, t_ns
+        self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
         if len(data) != (1 if overflow else 0) or (overflow and not 1 <= data[0] <= overflow):
             self.irregular += 1
@@ -94,8 +91,6 @@ class SyncFollower:
         if newest == 0:
             self._ticks.note(data[0], t_ns)
             return
-        if self._period_s is not None:  # the result may be negative after a damaged timestamp
-            ahead += overflow * round((elapsed_s / self._period_s - ahead) / overflow)
         self.irregular += ahead != 1
         self._ticks.note(newest + ahead, t_ns)
 

@@ -15,6 +15,7 @@ the event, and ``t_ns`` is its time on the host's monotonic clock.
 ``withheld``   scans of ``patch`` are no longer decoded
 ``polled``     a timeout ended an incomplete scan
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
+``sync``       the SYNC sent at ``t_ns`` has this ``number``; written if its counter does not determine it
 ``dropped``    ``frames`` frames were not written because the disk was too slow
 ``repaired``   the file is a copy of the readable part of a recording, with ``frames`` frames; ``damaged``
                counts the unreadable parts before the end
@@ -68,6 +69,8 @@ COMPLAINTS_KEPT: Final = 100
 """Maximum number of unreadable lines reported individually; further lines are only counted."""
 
 _MOST: Final = 2**63 - 1
+_MOST_SYNCS: Final = 2**53
+"""Maximum number of a SYNC; numbers of later ones also fit in 64 bits."""
 _LONGEST_HEADER: Final = 32 << 20
 """Maximum length of the first line in bytes. The layout files of a hundred of the largest patches fit."""
 _LONGEST_LINE: Final = 2 << 20
@@ -277,6 +280,8 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
     match event["event"]:
         case "dropped":
             _whole(event["frames"])
+        case "sync":
+            _whole(event["number"], least=1, most=_MOST_SYNCS)
         case "ended":
             _whole(event.get("frames", 0))  # missing from old journals
         case "repaired":
@@ -292,8 +297,8 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
     return event
 
 
-def _whole(value: object, least: int = 0) -> int:
-    """Return ``value``. Raises ValueError if ``value`` is not a 64-bit integer or is less than ``least``."""
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
+def _whole(value: object, least: int = 0, most: int = _MOST) -> int:
+    """Return ``value``. Raises ValueError if it is not an integer from ``least`` to ``most``."""
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError
     return value

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
@@ -29,6 +29,7 @@ from skinnode.process import clock
 from skinnode.record.journal import Header, facts_table
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import MCAP, McapFile
+from skinnode.record.recording_path import ALLOWED, RecordingFormat, is_folder, make_folder, name_in
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES
 
@@ -46,10 +47,6 @@ fsync call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
 """Maximum number of queued batches of frames, enough for several seconds on four fully loaded buses."""
-
-RecordingFormat = Literal["log", "blf", "mcap"]
-
-_ALLOWED: Final = "a folder (created if needed), or a file ending in .log, .blf or .mcap"
 
 _Job = Callable[[], None]
 
@@ -76,39 +73,6 @@ class RecorderStats:
     """Number of fields written; only an MCAP file contains fields."""
     fields_dropped: int = 0
     """Number of fields not written for the same reasons."""
-
-
-def name_in(folder: Path, hand: HandConfig, kind: RecordingFormat, now: datetime.datetime) -> Path:
-    """Return a path in ``folder`` for a recording, named after the hand, the date and the time."""
-    name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
-    return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
-
-
-def make_folder(path: Path) -> Path | None:
-    """Create the folder ``path`` and its parents; return ``path``, or None if the folder already existed.
-
-    Raises ConfigError if the folder cannot be created, or if its name has a suffix and is thus probably a
-    misspelt file name.
-    """
-    if path.is_dir():
-        return None
-    if path.suffix or path.exists():
-        raise ConfigError("recording", str(path), _ALLOWED)
-    try:
-        path.mkdir(parents=True)
-    except OSError as error:
-        raise ConfigError(
-            "recording", str(path), f"a folder that can be created ({error.strerror})"
-        ) from error
-    return path
-
-
-def _is_folder(path: Path) -> bool:
-    """Return whether ``path`` is a folder. Raises ConfigError if the path is not valid."""
-    try:
-        return path.is_dir()
-    except OSError as error:
-        raise ConfigError("recording", str(path), f"{_ALLOWED} ({error.strerror})") from error
 
 
 class Recorder:
@@ -140,11 +104,11 @@ class Recorder:
         now, asked, path = datetime.datetime.now().astimezone(), str(path), Path(path)
         self._made: Path | None = None
         """Folder that this recorder created; None if the folder already existed or is not used."""
-        if asked and (_is_folder(path) or path.suffix not in (*SUFFIXES, MCAP)):
+        if asked and (is_folder(path) or path.suffix not in (*SUFFIXES, MCAP)):
             self._made = make_folder(path)
             path = name_in(path, hand, kind, now)
         elif path.suffix not in (*SUFFIXES, MCAP):
-            raise ConfigError("recording", asked, _ALLOWED)
+            raise ConfigError("recording", asked, ALLOWED)
         offset_ns = clock.time_ns() - clock.monotonic_ns()
         hand = hand.without_layout_files()
         self._mcap = McapFile(path, hand) if path.suffix == MCAP else None
@@ -189,6 +153,10 @@ class Recorder:
         """Record a sent frame."""
         log_ns = clock.monotonic_ns() + self._offset_ns
         self._put(_Entry(lambda: self._write_frames(bus, (frame,), log_ns, sent=True), 1))
+
+    def numbered(self, bus: str, t_ns: int, number: int) -> None:
+        """Record the number of the SYNC sent at monotonic time ``t_ns``."""
+        self._put(_Entry(lambda: self._write_event(bus, t_ns, "sync", number=number)))
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Record that the host starts or resumes decoding a patch's scans."""

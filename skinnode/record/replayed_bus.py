@@ -46,7 +46,7 @@ class ReplayedBus:
         self._dispatcher = _PollerlessDispatcher(config, {}, 0)
         output = StreamOutput(Inline(), replay.publisher)
         receive_bus(hand, self._dispatcher, self._ticks)
-        self._own_syncs = SyncFollower(self._ticks, hand.sync.period_s)
+        self._own_syncs = SyncFollower(self._ticks)
         self.patches: dict[str, PatchReception] = {
             patch.name: receive_patch(patch, hand, self._dispatcher, self._ticks, output)
             for patch in hand.patches_on(config.name)
@@ -54,7 +54,9 @@ class ReplayedBus:
         for name, heard in self.patches.items():
             mine = [e for e in events if e["event"] == "overtaken" and e["patch"] == name]
             heard.stream.leave_out([e["received_ns"] for e in mine], _ROUNDING_NS)
-        self._events = deque(events)
+        self._events = deque(event for event in events if event["event"] != "sync")
+        numbered = [event for event in events if event["event"] == "sync"]
+        self._numbered = deque(numbered if hand.sync.counter_overflow else ())
         self._solvers: dict[str, ScanSolver | None] = {}
         self._without_baseline: set[str] = set()
         self._received = self._sent = 0
@@ -70,7 +72,7 @@ class ReplayedBus:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
             if frame.can_id == od.SYNC_COB_ID and not frame.extended:
-                self._own_syncs.on_sync(frame.data, frame.t_ns)
+                self._on_own_sync(frame.data, frame.t_ns)
             if frame.can_id == od.NMT_COB_ID and not frame.extended:
                 self._on_command(frame.data)
             return
@@ -88,6 +90,18 @@ class ReplayedBus:
             for heard in self.patches.values():
                 heard.stream.poll(frame.t_ns)
         self._dispatcher.measure(frame.t_ns)
+
+    def _on_own_sync(self, data: bytes, t_ns: int) -> None:
+        """Process a SYNC from the host; the journal has its number if the counter does not determine it."""
+        self._own_syncs.on_sync(data, t_ns)
+        if (
+            self._ticks.counter_overflow
+            and self._numbered
+            and self._numbered[0]["t_ns"] <= t_ns + _ROUNDING_NS
+        ):
+            number = self._numbered.popleft()["number"]
+            if bytes([self._ticks.counter_of(number)]) == data:  # otherwise, the time is damaged
+                self._ticks.note(number, t_ns)
 
     def _go_on(self, can_id: int) -> None:
         """Resume with the same solver after a node restart; a log alone does not show when the host resumed.

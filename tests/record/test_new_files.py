@@ -13,13 +13,11 @@ import pytest
 
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import ConfigError
-from skinnode.record import Recorder, convert, replay
+from skinnode.record import Recorder, convert
 from skinnode.record.convert import TARGETS
 from skinnode.record.log_files import LogFiles
 from skinnode.record.open_recording import open_recording
 from skinnode.transport.frame import Frame
-
-PERIOD_NS = 80_000_000
 
 
 def a_hand(*buses: str) -> HandConfig:
@@ -147,25 +145,6 @@ def test_a_conversion_never_deletes_the_file_of_another_command(
         convert.convert(source, target)
     assert [path for path in tmp_path.iterdir() if path.is_file()] == [target]
     assert target.read_bytes() == b"the other command's"
-
-
-def test_an_outage_of_many_counters_keeps_the_numbers_of_the_scans(tmp_path: Path) -> None:
-    """The bus is away for 500 SYNC periods, more than two rounds of the counter, which runs on."""
-    from skinnode.record.replayed_bus import ReplayedBus
-
-    hand, path = a_hand(), tmp_path / "run.log"
-    with Recorder(hand, path) as recorder:
-        for number in (*range(1, 300), *range(800, 1001)):
-            late_ns = number % 7 * 1_000_000  # the sending thread is late by up to 6 ms
-            frame = Frame(0x080, bytes([(number - 1) % 240 + 1]), number * PERIOD_NS + late_ns)
-            recorder.sent("can0", frame)
-    run = replay(path)
-    bus: ReplayedBus = run._buses["can0"]
-    numbers = []
-    for logged in run.frames():
-        bus.take(logged.frame, sent=logged.sent, whole=True)
-        numbers.append(bus._ticks.newest)
-    assert numbers == [*range(1, 300), *range(800, 1001)]
 
 
 @pytest.mark.parametrize("suffix", [".log", ".mcap"])

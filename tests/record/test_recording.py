@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
-from skinnode.config import BusConfig, HandConfig, load_hand, parse_hand
+from skinnode.config import BusConfig, HandConfig, SyncConfig, load_hand, parse_hand
 from skinnode.errors import BusError, ConfigError
 from skinnode.host import Host
 from skinnode.host.scan_solver import ScanSolver
@@ -148,6 +148,48 @@ def test_the_wall_clock_jumps_while_it_is_recorded(tmp_path: Path, jump_s: int) 
     times_s = [field.stamp.t_receive_ns * 1e-9 for field in replay(path) if field.stamp is not None]
     assert begun_s < min(times_s)
     assert max(times_s) < time.monotonic()
+
+
+@pytest.mark.parametrize("suffix", [".log", ".mcap"])
+def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    """The counter wraps after 4, so it tells nothing about the 12 periods or more of an outage."""
+    bus = BusConfig(name="can0", interface="virtual", channel=tmp_path.name)
+    hand = hand_on(bus)
+    hand = hand.model_copy(update={"sync": SyncConfig(period_ms=25, counter_overflow=4)})
+    away, send = threading.Event(), CanPort.send
+
+    def refusing(self: CanPort, can_id: int, *more: Any, **options: Any) -> None:
+        if can_id == 0x080 and away.is_set():
+            raise BusError("can0: 0x080 not sent (no buffer space)")
+        send(self, can_id, *more, **options)
+
+    monkeypatch.setattr(CanPort, "send", refusing)
+    path = tmp_path / f"run{suffix}"
+    with (
+        Fleet(hand) as fleet,
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
+        run = Run(fleet, host)
+        run.take(10)
+        before = max(scan for _, scan in run.live)
+        away.set()
+        failed = host.stats().sync.failed
+        end_s = time.monotonic() + PATIENCE_S
+        while host.stats().sync.failed < failed + 13 and time.monotonic() < end_s:
+            time.sleep(0.01)
+        away.clear()
+        run.take(10)
+        run.collect()
+    assert max(scan for _, scan in run.live) > before + 13 + 8
+    played = replay(path)
+    again = {key(field): field.displacement_m.tobytes() for field in played}
+    assert {which: again.get(which) for which in run.live} == {
+        which: field.displacement_m.tobytes() for which, field in run.live.items()
+    }
+    assert played.flaws == []
 
 
 @pytest.mark.parametrize("jump_s", [3600.0, -3600.0, 0.5])

@@ -114,7 +114,9 @@ def has_no_bytecode() -> bool:
     """Return whether most test modules have not been compiled yet, as in a new clone."""
     modules = list(Path(__file__).parent.rglob("test_*.py"))
     compiled = [importlib.util.cache_from_source(str(module)) for module in modules]
-    found = [os.path.exists(f"{path.removesuffix('.pyc')}-pytest-{pytest.__version__}.pyc") for path in compiled]
+    found = [
+        os.path.exists(f"{path.removesuffix('.pyc')}-pytest-{pytest.__version__}.pyc") for path in compiled
+    ]
     return sum(found) < len(found) / 2
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import pytest
 
 from skinnode.config import BusConfig
-from skinnode.conformance import Dut, connect
+from skinnode.conformance import Dut, Eds, connect
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode, VolatileMemory
@@ -75,11 +75,18 @@ def bench_on(channel: str, *, fd: bool = False) -> Iterator[Dut]:
         yield connect(port, NODE_ID)
 
 
+@pytest.fixture(scope="session")
+def own_eds() -> Eds:
+    """The EDS that is generated from the descriptor of the patch; reading it takes longer than most cases."""
+    with VirtualClock(), patch_on("descriptor"), bench_on("descriptor") as found:
+        return found.eds
+
+
 @pytest.fixture
-def dut(virtual_time: None) -> Iterator[Dut]:
+def dut(own_eds: Eds, virtual_time: None) -> Iterator[Dut]:
     channel = f"conformance-{uuid.uuid4().hex[:8]}"
-    with patch_on(channel), bench_on(channel) as found:
-        yield found
+    with patch_on(channel), CanPort(bus_in_this_time(channel)) as port:
+        yield connect(port, NODE_ID, own_eds)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ REQUIRE_COMPILERS: Final = "SKINNODE_REQUIRE_COMPILERS"
 COMPILERS: Final = ("gcc", "clang")
 DRIVER: Final = Path(__file__).with_name("c_driver.c")
 STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
-SANITIZED: Final = (*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZED: Final = (*STRICT, "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 LEVELS: Final = {"gcc": "-O1", "clang": "-O0"}
 """One program is optimised, and the other is as written; clang needs three times as long for -O1."""
 

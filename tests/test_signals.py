@@ -21,7 +21,7 @@ def kill():
     time.sleep(random.uniform(0.0, 1e-4))
     os.kill(os.getpid(), signal.SIGTERM)
 
-for _ in range(2000):
+for _ in range(1000):
     with stop_on_signal() as stop:
         killer = threading.Thread(target=kill)
         killer.start()

@@ -9,6 +9,8 @@ Each test goes to the next worker that is free. Tests of one group run one after
 
 from __future__ import annotations
 
+import gc
+import importlib.util
 import json
 import os
 import subprocess
@@ -95,13 +97,44 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels before the workers start; load them before the first test in real time.
+    """Compile kernels and modules before the workers start; load kernels before the first test in real time.
 
     Loading them keeps all threads of a process from running for a second, also those of simulated nodes."""
     if getattr(session.config, "workerinput", {}).get("workerid") == "gw0" and is_whole(session.config):
         warm_up.main()
-    if session.config.option.numprocesses and not session.config.option.collectonly and warm_up.is_needed():
-        subprocess.run([sys.executable, warm_up.__file__], check=True)
+    if session.config.option.numprocesses and not session.config.option.collectonly:
+        collecting = collect_once() if is_whole(session.config) and has_no_bytecode() else None
+        if warm_up.is_needed():
+            subprocess.run([sys.executable, warm_up.__file__], check=True)
+        if collecting is not None:
+            collecting.wait()
+
+
+def has_no_bytecode() -> bool:
+    """Return whether most test modules have not been compiled yet, as in a new clone."""
+    modules = list(Path(__file__).parent.rglob("test_*.py"))
+    compiled = [importlib.util.cache_from_source(str(module)) for module in modules]
+    found = [
+        os.path.exists(f"{path.removesuffix('.pyc')}-pytest-{pytest.__version__}.pyc") for path in compiled
+    ]
+    return sum(found) < len(found) / 2
+
+
+def collect_once() -> subprocess.Popen[bytes]:
+    """Start a process that collects the tests, which compiles all modules: or each worker would do it.
+
+    What is wrong with a module, the workers report."""
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider"]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def pytest_collection_finish() -> None:
+    """Exclude what has been collected from garbage collection.
+
+    Commands of the product that run in this process collect garbage before they start: with all modules and
+    tests, each time for a quarter of a second."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -7,7 +7,7 @@ in the same order and at the same virtual times on every machine, and a minute o
 
     with VirtualClock():
         with Fleet(hand), skinnode.Host(hand) as host:  # host and nodes on a bus with interface "timed"
-            field = host.next_field(timeout_s=5.0)
+            field = host.fields(timeout_s=5.0).get()
 
 A thread that waits without using :mod:`skinnode.process.clock`, for example on a socket, a subprocess or a
 ``threading`` event, blocks the whole program.

@@ -147,7 +147,7 @@ def warm_up() -> None:
     hand = _hand()
     load_kernels()
     for patch in hand.patches:
-        check_solvable(patch, hand.solver)
+        check_solvable(patch, hand.solver, hand.sync.period_s)
 
 
 def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, Any]:

@@ -196,7 +196,7 @@ def _running(
 
     tell("compiling the kernels once" if is_cold() else "preparing the solvers")
     for patch in plan.patches:
-        check_solvable(patch, plan.solver)
+        check_solvable(patch, plan.solver, plan.sync.period_s)
     if simulate:
         from skinnode.demo.simulated import simulated
 

@@ -61,7 +61,7 @@ def host(
     if is_cold():
         report.note("compiling the kernels once; this takes a few seconds")
     for patch in plan.patches:  # no resource is open yet, so Ctrl-C may end the program at once
-        check_solvable(patch, plan.solver)
+        check_solvable(patch, plan.solver, plan.sync.period_s)
     with stop_on_signal() as stop, published.claimed(plan):  # refused before the bring-up
         status = _run(plan, seconds, report, stop, published)
     if status:

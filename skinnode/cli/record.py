@@ -87,7 +87,7 @@ def _run(
     from skinnode.record import followed
 
     for patch in plan.patches:
-        check_solvable(patch, plan.solver)
+        check_solvable(patch, plan.solver, plan.sync.period_s)
     try:
         with Host.from_config(plan, cancelled=stop.is_set, tap=recorder) as running:
             patches = counted(len(plan.patches), "patch", "patches")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from typing import Final
 
 from skinnode.conformance.case import NotApplicable
@@ -11,6 +10,7 @@ from skinnode.conformance.eds_reader import Eds, EdsEntry
 from skinnode.conformance.sdo import Aborted, SdoClient
 from skinnode.conformance.tester import QUIET_S, Failed, Tester, describe
 from skinnode.errors import NodeTimeout
+from skinnode.process import clock
 
 START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
 """NMT command specifiers."""
@@ -88,8 +88,8 @@ class Dut:
         self.bus.clear()
         self.nmt(RESET_NODE)
         self.up = False
-        end_s = time.monotonic() + BOOT_S
-        while time.monotonic() < end_s:
+        end_s = clock.monotonic() + BOOT_S
+        while clock.monotonic() < end_s:
             boot = self.bus.take(self.error_control_id, _ASK_EACH_S, lambda frame: frame.data == b"\0")
             if boot is not None:
                 self.bus.forget()

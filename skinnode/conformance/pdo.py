@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -11,6 +10,7 @@ from skinnode.conformance.case import NotApplicable
 from skinnode.conformance.dut import Dut
 from skinnode.conformance.sdo import Aborted
 from skinnode.conformance.tester import Failed, describe
+from skinnode.process import clock
 from skinnode.text.words import counted
 from skinnode.transport import Frame
 
@@ -184,6 +184,6 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 def drain(dut: Dut, can_id: int) -> None:
     """Discard frames with ``can_id`` until none arrives for 20 ms, but for at most half a second."""
-    end_s = time.monotonic() + 0.5
-    while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
+    end_s = clock.monotonic() + 0.5
+    while clock.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

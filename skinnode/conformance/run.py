@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
@@ -15,6 +14,7 @@ from skinnode.conformance.eds_reader import Eds, parse_eds
 from skinnode.conformance.sdo import SdoClient
 from skinnode.conformance.tester import Failed, Tester
 from skinnode.errors import BusError, ConfigError, NodeTimeout
+from skinnode.process import clock
 from skinnode.protocol.eds_files import eds_name, eds_text
 from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
@@ -127,7 +127,7 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
 
 def run_case(dut: Dut, case: Case) -> Result:
     """Reset the node and run one case."""
-    begun_s = time.monotonic()
+    begun_s = clock.monotonic()
     verdict, why = Verdict.PASSED, ""
     dut.bus.begin()
     try:
@@ -143,7 +143,7 @@ def run_case(dut: Dut, case: Case) -> Result:
         raise
     except Exception as error:  # e.g. a response that the case could not decode
         verdict, why = Verdict.FAILED, f"unexpected response ({type(error).__name__}: {error})"
-    return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
+    return Result(case, verdict, why, clock.monotonic() - begun_s, dut.bus.trace)
 
 
 def _put_back(dut: Dut, before: dict[tuple[int, int], bytes]) -> list[str]:

@@ -6,11 +6,11 @@ response is therefore not lost. Every wait has a time limit.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
+from skinnode.process import clock
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
@@ -67,13 +67,13 @@ class Tester:
         """Whether PDOs may be sent in CAN FD frames of up to 64 bytes."""
         self._inbox: deque[Frame] = deque(maxlen=_INBOX_FRAMES)
         self._trace: deque[TraceLine] = deque(maxlen=_TRACE_FRAMES)
-        self._begun_ns = time.monotonic_ns()
+        self._begun_ns = clock.monotonic_ns()
 
     def begin(self) -> None:
         """Begin a case: discard all received frames and clear the trace."""
         self.clear()
         self._trace.clear()
-        self._begun_ns = time.monotonic_ns()
+        self._begun_ns = clock.monotonic_ns()
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
@@ -82,7 +82,7 @@ class Tester:
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
         """Send a frame; return the time of transmission (monotonic clock, ns)."""
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         self._note(now_ns, True, can_id, data, remote)
         self._port.send(can_id, data, remote=remote)
         return now_ns
@@ -117,8 +117,8 @@ class Tester:
             if wanted(frame):
                 self._inbox.remove(frame)
                 return frame
-        end_s = time.monotonic() + within_s
-        while (left_s := end_s - time.monotonic()) > 0:
+        end_s = clock.monotonic() + within_s
+        while (left_s := end_s - clock.monotonic()) > 0:
             if self._receive(left_s) and wanted(self._inbox[-1]):
                 return self._inbox.pop()
         return None
@@ -147,8 +147,8 @@ class Tester:
 
     def wait(self, for_s: float) -> None:
         """Receive frames into the inbox for ``for_s`` seconds."""
-        end_s = time.monotonic() + for_s
-        while (left_s := end_s - time.monotonic()) > 0:
+        end_s = clock.monotonic() + for_s
+        while (left_s := end_s - clock.monotonic()) > 0:
             self._receive(left_s)
 
     def pending(self, can_id: int) -> list[Frame]:

@@ -165,7 +165,7 @@ def _brought_up(
     """Configure and start the nodes. Closing ``stack`` makes them pre-operational again."""
     for patch in hand.patches:
         go_on_unless(options.cancelled)
-        check_solvable(patch, hand.solver)
+        check_solvable(patch, hand.solver, hand.sync.period_s)
     try:
         ready = configure_all(nodes, hand.bring_up.missing, options.boot_deadline_s, options.cancelled)
         for node in nodes:

@@ -129,10 +129,15 @@ def tracker_options(
     )
 
 
-def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
+def check_solvable(patch: PatchConfig, config: SolverConfig, period_s: float) -> None:
     """Check that the solver supports a patch's layout, and prepare its kernels and tables.
 
     The preparation is slow, so it must be done before any node is started.
+
+    Args:
+        patch: Configuration of the patch.
+        config: Settings of the solver.
+        period_s: SYNC period (s) of the hand. The thresholds of the touch tests depend on it.
 
     Raises:
         ConfigError: if the solver cannot compute displacements for the layout.
@@ -146,6 +151,9 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
             operator=config.operator,
             relative_noise=patch.relative_noise,
             tolerances=made,
+            detect=config.detect,
+            false_alarms_per_hour=config.false_alarms_per_hour,
+            scan_period_s=period_s,
         )
         tracker.update(resistance_ohm(layout, layout.upper_m))
         tracker.prepare()

@@ -15,13 +15,18 @@ def without_long_collections() -> Iterator[None]:
     With numba and canopen loaded, a full collection stops all threads for 30 ms on a small computer, during
     which a node can miss a scan or a SYNC can be late. Enter the block once set-up is complete. Existing
     objects that become cyclic garbage during the block are freed after it.
+
+    If the program has already excluded objects, with an outer block or with :func:`gc.freeze`, all objects
+    stay excluded after the block: the outer block may still need it.
     """
     gc.collect()
+    nested = gc.get_freeze_count() > 0
     gc.freeze()
     try:
         yield
     finally:
-        gc.unfreeze()
+        if not nested:
+            gc.unfreeze()
 
 
 @contextmanager

@@ -30,7 +30,7 @@ def test_a_further_patch_takes_little_memory() -> None:
     def held_mb(patches: int) -> float:
         hand = scale.hand_of(patches)
         with VirtualClock(), Fleet(hand, scene=scale.scene_of(1)), Host.from_config(hand):
-            clock.sleep(1.0)
+            clock.sleep(0.5)
             gc.collect()
             return tracemalloc.get_traced_memory()[0] / 1e6
 
@@ -57,6 +57,7 @@ def test_the_command_prints_writes_and_plots(
 ) -> None:
     monkeypatch.setattr(scale, "FIXED", 1)
     monkeypatch.setattr(scale, "TOUCHED", (0, 1))
+    monkeypatch.setattr(scale, "CHANGED_SCANS", 20)  # of which two are sent in full
     file, image = tmp_path / "scale.json", tmp_path / "scale.png"
     with pytest.raises(SystemExit) as done:
         main(

@@ -18,6 +18,8 @@ from skinnode.protocol.profile import PatchProfile
 
 from .conftest import NODE_ID, patch_on
 
+pytestmark = pytest.mark.system_time
+
 
 @pytest.fixture
 def patch() -> Iterator[list[str]]:

@@ -14,6 +14,8 @@ from skinnode.conformance import Dut, Verdict, connect, parse_eds, run_cases, se
 from skinnode.errors import ConfigError, ProfileError
 from skinnode.transport import CanPort
 
+pytestmark = pytest.mark.system_time  # threads of the canopen library
+
 NODE_ID = 0x21
 SHEET = """
 [DeviceInfo]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +10,11 @@ import pytest
 
 from skinnode.config import BringUpConfig, HandConfig, Missing
 from skinnode.errors import NodeError, NodeTimeout
-from skinnode.host import Host, start
+from skinnode.host import Host, lifecycle, start
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.scan_solver import ScanSolver
+from skinnode.solve.detect import touch_test
+from vcan_sim.fleet import Fleet
 
 from .conftest import Rack, eventually
 
@@ -77,3 +80,22 @@ def test_a_defect_at_every_bring_up_of_a_node_ends_the_start_unless_nodes_may_be
         for patch in ("p1", "p0"):  # which is brought up as one that came later
             assert host.fields(timeout_s=10, patch=patch).get(10) is not None
         assert eventually(lambda: host.stats().nodes["p0"].rejoins == 1)
+
+
+def test_nothing_is_computed_between_the_configuration_of_the_nodes_and_their_start(
+    make_hand: Callable[..., HandConfig],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The touch tests depend on the period of the scans: those of another period would be of no use."""
+    configure_all, before = lifecycle.configure_all, list[int]()
+
+    def configure(*arguments: Any) -> Any:
+        before.append(touch_test._thresholds.cache_info().misses)
+        return configure_all(*arguments)
+
+    monkeypatch.setattr(lifecycle, "configure_all", configure)
+    touch_test._thresholds.cache_clear()
+    hand = make_hand(sync={"period_ms": 33}, solver={"false_alarms_per_hour": 0.7})
+    with Fleet(hand), Host.from_config(hand) as host:
+        assert host.fields(timeout_s=5).get() is not None
+    assert before == [touch_test._thresholds.cache_info().misses]

@@ -220,7 +220,7 @@ def worlds(draw: st.DrawFn) -> tuple[ModelNode, list[Frame]]:
     return node, arrivals
 
 
-@settings(deadline=None, max_examples=500)
+@settings(deadline=None, max_examples=250)
 @given(world=worlds(), polled=st.booleans())
 def test_no_scan_is_ever_mixed_from_two(world: tuple[ModelNode, list[Frame]], polled: bool) -> None:
     node, frames = world
@@ -298,7 +298,7 @@ def changed(frame: Frame, at: int, by: int) -> Frame:
     return dataclasses.replace(frame, data=bytes(data))
 
 
-@settings(deadline=None, max_examples=500)
+@settings(deadline=None, max_examples=250)
 @given(world=falsified())
 def test_nothing_false_is_ever_complete(world: tuple[ModelNode, list[Frame]]) -> None:
     node, frames = world

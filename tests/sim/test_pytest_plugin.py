@@ -77,11 +77,11 @@ def test_a_bus_with_a_second_master(host, skin_faults, skin_clock):
 
 
 @pytest.mark.skin_bus("timed")
-def test_a_minute_passes(host, skin_clock):
+def test_time_passes(host, skin_clock):
     begin_s = skin_clock.monotonic()
-    skin_clock.sleep(20.0)
-    assert abs(skin_clock.monotonic() - begin_s - 20.0) < 1e-9
-    assert host.stats().patches["palm"].solved > 390
+    skin_clock.sleep(5.0)
+    assert abs(skin_clock.monotonic() - begin_s - 5.0) < 1e-9
+    assert host.stats().patches["palm"].solved > 90
 
 
 def test_that_fails(host):

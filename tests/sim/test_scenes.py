@@ -19,7 +19,7 @@ from skinnode.errors import ConfigError
 from vcan_sim.cli import main
 from vcan_sim.contact.layer import cell_response
 from vcan_sim.fleet import Fleet
-from vcan_sim.scenes import PatchScene, bind_scene, load_scene, parse_scene
+from vcan_sim.scenes import PatchScene, bind, bind_scene, load_scene, parse_scene
 from vcan_sim.scenes.motions import pose_at
 from vcan_sim.scenes.tables import TouchConfig
 from vcan_sim.scenes.window import solve_depth
@@ -286,7 +286,9 @@ def test_times_can_be_asked_in_any_order(slide: PatchScene) -> None:
     """Two scenes made from the same tables agree to the byte, whichever time comes first."""
     touch = slide.histories[0].touch.model_dump(exclude_none=True)
     touch["motions"] = list(touch["motions"])
+    bind._history.cache_clear()
     other = one({"shape": "sphere", "radius_m": 10e-3, "friction": 0.5}, touch)
+    assert other.histories[0] is not slide.histories[0]
     times = np.random.default_rng(3).uniform(0.0, 2.3, 24)
     backwards = {t: other.upper_m(t) for t in sorted(times, reverse=True)}
     for t in times:
@@ -294,6 +296,20 @@ def test_times_can_be_asked_in_any_order(slide: PatchScene) -> None:
         np.testing.assert_allclose(
             slide.upper_m(t) - slide.layout.upper_m, slide.truth(t).displacement_m, atol=1e-15
         )
+
+
+def test_a_touch_is_computed_once_for_the_same_skin_and_body() -> None:
+    """Tests of a program start the same scene again and again."""
+    first, again = (sphere({"depth_m": 1e-4}, friction=0.3) for _ in range(2))
+    assert first.histories == again.histories
+    for other in (
+        sphere({"depth_m": 1e-4}, friction=0.4),
+        sphere({"depth_m": 1.1e-4}, friction=0.3),
+        sphere({"depth_m": 1e-4}, friction=0.3, step_s=0.01),
+        sphere({"depth_m": 1e-4}, friction=0.3, skin={"thickness_m": 3e-3}),
+    ):
+        assert other.histories != first.histories
+        assert other.upper_m(0.7).tobytes() != first.upper_m(0.7).tobytes()
 
 
 def test_the_skin_moves_smoothly(slide: PatchScene) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from vcan_sim.scenes.faults import schedule_of
 from vcan_sim.scenes.history import History
 from vcan_sim.scenes.patch import PatchScene
 from vcan_sim.scenes.response import Electrodes
-from vcan_sim.scenes.tables import SceneConfig, SkinConfig, read_scene
+from vcan_sim.scenes.tables import SceneConfig, SkinConfig, TouchConfig, read_scene
 from vcan_sim.scenes.touch_checks import check_apart, check_on_patch, error_at, path_of, window_of_touch
+from vcan_sim.scenes.window import BodyKey, Window
 
 
 def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
@@ -86,12 +88,27 @@ def _patch_scene(scene: SceneConfig, hand: HandConfig, patch: PatchConfig, numbe
                 check_apart(scene, (i, touch, windows[i], paths[i]), (j, other, windows[j], paths[j]), layer)
     if not touches:
         return PatchScene(layout, hand.simulation, number, scene.step_s, scene.repeat_s, ())
-    electrodes = Electrodes.of(layer, places, float(np.median(layout.upper_m[..., 2])))
     histories = []
     for i, touch in touches:
         body = scene.body(touch.body)
+        key = BodyKey(body.build())
         histories += [
-            History(each, body.build(), body.friction, windows[i], scene.step_s, electrodes)
-            for each in touch.each
+            _history(each, key, body.friction, windows[i], scene.step_s, layer, layout) for each in touch.each
         ]
     return PatchScene(layout, hand.simulation, number, scene.step_s, scene.repeat_s, tuple(histories))
+
+
+@functools.lru_cache(maxsize=16)
+def _history(  # noqa: PLR0913 - all inputs of a touch
+    touch: TouchConfig,
+    body: BodyKey,
+    friction: float,
+    window: Window,
+    step_s: float,
+    layer: Layer,
+    layout: PatchLayout,
+) -> History:
+    """Return the history of a touch; cached, because tests of a program start the same scene many times."""
+    places = np.ascontiguousarray(layout.upper_m[..., :2].reshape(-1, 2))
+    electrodes = Electrodes.of(layer, places, float(np.median(layout.upper_m[..., 2])))
+    return History(touch, body.shape, friction, window, step_s, electrodes)

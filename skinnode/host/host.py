@@ -18,6 +18,7 @@ from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, EventSubscription
 from skinnode.host.hand_frame import HandGatherer, HandSubscription, require_one_sync
 from skinnode.host.health import BusHealth, PatchHealth, faults_of
+from skinnode.host.health_memory import HealthMemory
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.lifecycle import HostParts, StartOptions, never, running_parts
 from skinnode.host.other_masters import OtherMasterStats
@@ -170,8 +171,8 @@ class Host:
         with running_parts(hand, options) as parts:
             host = cls(parts)
             with HealthWatch(
-                host._all_health,
-                host._all_bus_health,
+                HealthMemory(parts.nodes, host._facts, host.health),
+                HealthMemory(parts.buses, host._bus_facts, host.bus_health),
                 parts.events,
                 parts.defects,
                 host._all_defects,
@@ -306,16 +307,26 @@ class Host:
         """
         return self._events.subscribe(capacity)
 
-    def _all_health(self) -> dict[str, PatchHealth]:
-        return {patch: self.health(patch) for patch in self._nodes}
+    def _facts(self, patch: str) -> object | None:
+        """Return everything that determines the health of an operational patch, apart from ages."""
+        node = self._nodes[patch]
+        monitor, stream = node.monitor, node.stream
+        if not monitor.is_inconspicuous(
+            clock.monotonic_ns(), node.heartbeat_s, self.hand.sync.period_s, stream.t_passed_ns
+        ):
+            return None
+        return monitor.counts, stream.conflicts, faults_of(self._publisher.latest(patch))
 
-    def _all_bus_health(self) -> dict[str, BusHealth]:
-        return {bus: self.bus_health(bus) for bus in self._buses}
+    def _bus_facts(self, bus: str) -> object:
+        """Return everything that determines the health of a bus, apart from its load."""
+        served = self._buses[bus]
+        return served.facts, self._lacks_sync(served)
 
     def _all_defects(self) -> dict[str, DefectStats]:
         of_buses = [bus.link.defects for bus in self._buses.values()]
         of_patches = [node.defects for node in self._nodes.values()]
-        return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
+        every = (self._defects, *of_buses, *of_patches)
+        return {each.subject: each.stats() for each in every if each.count}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
         """Record all traffic from now on with ``tap``. Only one tap may be active at a time.

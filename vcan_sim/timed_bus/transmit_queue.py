@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from vcan_sim.timed_bus.frame import CanFrame
@@ -25,6 +26,9 @@ class TransmitQueue(Protocol):
 
     def push(self, waiting: Waiting) -> None:
         """Add a frame to the queue."""
+
+    def extend(self, waiting: Sequence[Waiting]) -> None:
+        """Add frames to the queue."""
 
     def put_back(self, waiting: Waiting) -> None:
         """Put back a frame that was removed by :meth:`pop` but not sent."""
@@ -50,6 +54,10 @@ class FifoQueue:
     def push(self, waiting: Waiting) -> None:
         """Add a frame to the queue."""
         self._frames.append(waiting)
+
+    def extend(self, waiting: Sequence[Waiting]) -> None:
+        """Add frames to the queue."""
+        self._frames.extend(waiting)
 
     def put_back(self, waiting: Waiting) -> None:
         """Put back a frame that was removed by :meth:`pop` but not sent."""
@@ -82,6 +90,11 @@ class PriorityQueue:
         heapq.heappush(self._frames, waiting)
 
     put_back = push
+
+    def extend(self, waiting: Sequence[Waiting]) -> None:
+        """Add frames to the queue."""
+        for each in waiting:
+            self.push(each)
 
     def head(self) -> Waiting:
         """Return the frame with the highest priority."""

@@ -154,9 +154,8 @@ class Segment:
 
     def send_all(self, station: int, frames: Sequence[CanFrame]) -> None:
         """Queue several frames with the same identifier from a station, like :meth:`send`."""
-        idle = not self.bus.waiting(station)
         self.bus.send_all(self.clock.now_ns, station, frames)
-        if idle or self._due_ns is None:
+        if self._due_ns is None or self.bus.waiting(station) == len(frames):  # otherwise, already planned
             self._plan()
 
     def disturb(self, rule: Disturbance) -> None:

@@ -325,8 +325,7 @@ class Host:
     def _all_defects(self) -> dict[str, DefectStats]:
         of_buses = [bus.link.defects for bus in self._buses.values()]
         of_patches = [node.defects for node in self._nodes.values()]
-        every = (self._defects, *of_buses, *of_patches)
-        return {each.subject: each.stats() for each in every if each.count}
+        return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
         """Record all traffic from now on with ``tap``. Only one tap may be active at a time.

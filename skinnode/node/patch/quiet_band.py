@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from skinnode.model.layout import Float
 from skinnode.protocol.codes import Codes, CodeScale, as_baseline
@@ -44,7 +45,7 @@ class QuietBand:
         return bool(np.logical_and.reduce(inside, axis=None))
 
     @classmethod
-    def of(cls, sent: Codes, threshold: int, baseline_ohm: Float, scale: CodeScale) -> QuietBand | None:
+    def of(cls, sent: Codes, threshold: int, baseline_ohm: ArrayLike, scale: CodeScale) -> QuietBand | None:
         """Return the band around the codes that were last sent, or None if there is none.
 
         There is none if a code is reserved, or if a baseline is unknown.

@@ -359,11 +359,12 @@ class FaultyNode(PatchNode):
             and not self._is_cut_off
         ):
             chunks, tally = [first, *payloads], self._injector.tally
-            tally.handed[Kind.CHUNK] += len(chunks)
-            self._faulty_scans.pass_all(len(chunks))
+            count = len(chunks)
+            tally.handed[Kind.CHUNK] += count
+            self._faulty_scans.pass_all(count)
             bursts.send_burst(can_id, chunks)
-            tally.emitted[Kind.CHUNK] += len(chunks)
-            self._on_sent(can_id, len(chunks))
+            tally.emitted[Kind.CHUNK] += count
+            self._on_sent(can_id, count)
             return
         self._out(can_id, first)
         super()._send_all(can_id, payloads)

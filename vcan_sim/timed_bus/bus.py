@@ -389,11 +389,12 @@ class TimedBus:
         free, end = start + course.free, start + course.end
         rates, bit, queue, index = self._rates, self._bit, sender.queue, sender.index
         ceil_ns, events, frames = rates.ceil_ns, self._events, self._frames
-        start_ns, times = ceil_ns(start), None
+        start_ns, times, exact = ceil_ns(start), None, rates.ticks_per_ns == 1
         self._flight = self._start = self._next = None
         while end <= until:
             frame = waiting.frame
-            events.append(Delivered(ceil_ns(end), index, frame, receivers, waiting.queued_ns, start_ns))
+            end_ns = end if exact else ceil_ns(end)
+            events.append(Delivered(end_ns, index, frame, receivers, waiting.queued_ns, start_ns))
             identifier = (frame.can_id, frame.extended)
             frames[identifier] = frames.get(identifier, 0) + 1
             sender.sending, self._free = None, free
@@ -409,8 +410,8 @@ class TimedBus:
             after_end, recessive, after_free = times = undisturbed_times(waiting.frame, False, rates)
             free, end = start + after_free, start + after_end
             self._recessive_from = start + recessive
-            start_ns = ceil_ns(start)
-            self._occupancy.add(start_ns, ceil_ns(free))
+            start_ns = start if exact else ceil_ns(start)
+            self._occupancy.add(start_ns, free if exact else ceil_ns(free))
         if times is not None:  # otherwise, the frame is still the first one
             course = Course(senders, *times)
         self._flight = Flight(start, course, {index: waiting}, senders, receivers)

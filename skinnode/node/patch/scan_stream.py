@@ -205,9 +205,9 @@ class ScanStream:
     def _due(self, carrier: Tpdo, t_ns: int) -> Iterator[bytes]:
         """Yield the chunks that are due. Each counts as sent when the next is requested."""
         unsent, inhibit_ns = self._unsent, carrier.parameters.inhibit_ns
-        earliest_ns = t_ns - self._catch_up_ns
+        earliest_ns, synchronous = t_ns - self._catch_up_ns, carrier.parameters.synchronous
         while unsent and carrier.ready_ns <= t_ns:
-            if carrier.parameters.synchronous and not self._tpdos.window.lets_out(carrier.number, t_ns):
+            if synchronous and not self._tpdos.window.lets_out(carrier.number, t_ns):
                 unsent.clear()
                 return
             self.chunk = chunk = unsent.popleft()

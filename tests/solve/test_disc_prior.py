@@ -11,6 +11,7 @@ import skinnode as sk
 from skinnode.bench import accuracy_families as families
 from skinnode.bench import family_scenes
 from skinnode.bench.case import preset
+from skinnode.bench.trust_loads import Bonded
 from skinnode.bench.truth import Skin
 from skinnode.solve.posterior.local import discs
 from skinnode.solve.posterior.local.discs import LOADS, Effects
@@ -146,6 +147,36 @@ def test_errors_on_a_bonded_layer_are_within_the_claim(skin, family):
         error = np.abs(field.displacement_m - scene.truth_m)
         assert (error <= 6.0 * field.displacement_std_m).all()
         assert (error <= field.half_width_95_m).mean() > 0.8
+
+
+def test_a_small_body_on_a_thin_layer_is_found_beside_another(skin):
+    """On a layer as thick as the clearance, in closed form: a body moves hardly more than one electrode."""
+    layout, found = skin.layout, 0
+    for seed in range(4):
+        row, column = 2 + seed % 2, 2 + seed // 2
+        near, far = (tuple(layout.upper_m[u, n, :2]) for u, n in ((row, column), (row + 4, column + 4)))
+        bodies = (
+            Bonded(near, 0.8 * layout.pitch_m, layout.height_m, 0.2 * layout.height_m),
+            Bonded(far, 0.8 * layout.pitch_m, layout.height_m, 0.1 * layout.height_m),
+        )
+        truth = skin.displacement_m(bodies, 1.0)
+        field = solved(skin, truth, 1e-3, seed)
+        assert (np.abs(field.displacement_m - truth) <= 5.0 * field.displacement_std_m).all()
+        found += field.displacement_m[row + 4, column + 4, 2] < -0.05 * layout.height_m
+    assert found >= 3
+
+
+@pytest.mark.parametrize(("name", "height"), [("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0)])
+def test_a_single_electrode_that_the_readings_hardly_show_is_within_the_claim(name, height):
+    """At a noise of 3e-3, a body that moves one electrode by a tenth of the clearance may go unnoticed."""
+    skin = Skin(preset(name, height))
+    random = np.random.default_rng(8)
+    for seed in range(6):
+        truth = np.zeros(skin.layout.upper_m.shape)
+        truth[random.integers(10), random.integers(10), 2] = -0.1 * skin.layout.height_m
+        field = solved(skin, truth, 3e-3, seed)
+        assert (np.abs(field.displacement_m - truth) <= 5.0 * field.displacement_std_m).all()
+        assert field.displacement_std_m.max() < 0.2 * skin.layout.height_m
 
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e-3])

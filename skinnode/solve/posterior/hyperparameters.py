@@ -124,16 +124,18 @@ class Hyperparameters:
         own = estimator.noise_variance.reshape(std.shape)
         unseen = (std**2 - core**2) / (prior.doubt - prior.smooth_share)
         expected = (prior.scale2 * prior.covariance.diagonal()).reshape(std.shape)
-        light = self._least * prior.uniform.diagonal().reshape(std.shape)
-        light *= np.minimum(unseen / expected, 1.0)
-        share = disc_claim.prior_shares(estimator.free_displacement().reshape(std.shape), self.discs.discs)
+        unknown = np.minimum(unseen / expected, 1.0)
+        light = self._least * prior.uniform.diagonal().reshape(std.shape) * unknown
+        moved = estimator.free_displacement().reshape(std.shape)
+        share = np.minimum(disc_claim.prior_shares(moved, unknown, self.discs.discs), prior.doubt)
         return np.sqrt(std**2 + spread + light), np.sqrt(own + share * unseen + spread)
 
     def with_undetected(self, std: Float) -> Float:
         """Return ``std`` (U, f), in pitches, including a local touch that remains undetected."""
         if self.discs is None:
             return std
-        return np.sqrt(std**2 + disc_claim.undetected_variance(self._estimator.information(), self._clearance))
+        variance = disc_claim.undetected_variance(self._estimator.information(), self._clearance)
+        return np.sqrt(std**2 + variance)
 
     def set_least(self, observation: Observation) -> None:
         """Set the minimum prior scale from the noise of a frame."""

@@ -267,7 +267,7 @@ class MapEstimator:
         return np.asarray(self.load_prior.scale2 * self.load_prior.covariance - explained)
 
     def information(self) -> Float:
-        """Return Σ (∂r/∂x)² (U, f) of each coordinate from the last linearisation of all wires, in pitch⁻²."""
+        """Return Σ (∂r/∂x)² (U, f), in pitch⁻², from the last linearisation of all wires."""
         slopes = self._b.jt[:, self._free]
         return np.asarray(np.einsum("uik,uik->ui", slopes, slopes))
 

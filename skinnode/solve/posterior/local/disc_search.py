@@ -1,10 +1,11 @@
 """Fits soft load discs to a frame.
 
-The data are linearised at the current displacement, and whitened with the covariance expected on an untouched
-skin, whose loads are equally small everywhere. The first disc is placed where a load, on a half-space or on a
-thin bonded layer, matches the whitened data best, and is then fitted (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a
-load matches the remaining data best, as long as the gain in evidence outweighs the additional parameters. In
-a stream, the search starts at the discs of the last frame.
+The data are linearised at the current displacement, and whitened with the covariance expected on an
+untouched skin, whose loads are equally small everywhere. The first disc is placed where a load, on a half-
+space or on a thin bonded layer, matches the whitened data best, and is then fitted
+(:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a load matches the remaining
+data best, as long as the gain in evidence outweighs the additional parameters. In a stream, the search
+starts at the discs of the last frame.
 
 No disc is used if equal loads over the whole patch explain the frame better than the discs, or if the loads
 require many or large discs.
@@ -38,8 +39,8 @@ BEYOND: Final = 1
 AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
 SHAPES: Final = ((kernels.RADIUS, kernels.LAYER), (0.6, 4.0))
-"""Radius R in cells and layer share β at which the search for a new disc starts: a contact on a half-space, and
-one on a thin bonded layer, which moves the skin only near the body."""
+"""Radius R in cells and layer share β at which the search for a new disc starts: a contact on a half-space,
+and one on a thin bonded layer, which moves the skin only near the body."""
 REACH: Final = 4.5
 """Radius around the start of a search within which the effects of loads are computed, in cells."""
 MOST: Final = 4

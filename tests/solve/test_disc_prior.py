@@ -11,8 +11,7 @@ import skinnode as sk
 from skinnode.bench import accuracy_families as families
 from skinnode.bench import family_scenes
 from skinnode.bench.case import preset
-from skinnode.bench.trust_loads import Bonded
-from skinnode.bench.truth import Skin
+from skinnode.bench.truth import Converter, Skin
 from skinnode.solve.posterior.local import discs
 from skinnode.solve.posterior.local.discs import LOADS, Effects
 
@@ -149,21 +148,21 @@ def test_errors_on_a_bonded_layer_are_within_the_claim(skin, family):
         assert (error <= field.half_width_95_m).mean() > 0.8
 
 
-def test_a_small_body_on_a_thin_layer_is_found_beside_another(skin):
-    """On a layer as thick as the clearance, in closed form: a body moves hardly more than one electrode."""
-    layout, found = skin.layout, 0
-    for seed in range(4):
-        row, column = 2 + seed % 2, 2 + seed // 2
-        near, far = (tuple(layout.upper_m[u, n, :2]) for u, n in ((row, column), (row + 4, column + 4)))
-        bodies = (
-            Bonded(near, 0.8 * layout.pitch_m, layout.height_m, 0.2 * layout.height_m),
-            Bonded(far, 0.8 * layout.pitch_m, layout.height_m, 0.1 * layout.height_m),
-        )
-        truth = skin.displacement_m(bodies, 1.0)
-        field = solved(skin, truth, 1e-3, seed)
-        assert (np.abs(field.displacement_m - truth) <= 5.0 * field.displacement_std_m).all()
-        found += field.displacement_m[row + 4, column + 4, 2] < -0.05 * layout.height_m
-    assert found >= 3
+@pytest.mark.parametrize(
+    ("family", "number", "name"), [("ridge", 1001, "staggered"), ("two", 1019, "aligned")]
+)
+def test_a_small_body_on_a_thin_layer_is_found(family, number, name):
+    """The simulator solves the contact. A search for loads on a half-space alone finds no such body."""
+    skin = Skin(preset(name, 0.5))
+    random = np.random.default_rng([number, family_scenes.FAMILIES.index(family)])
+    truth = family_scenes.draw(family, skin, random, bonded=True).truth_m
+    frame, _, _ = Converter(sigma=1e-3).read(skin.resistance_ohm(truth), skin.rest_ohm, random)
+    posterior = sk.Posterior(
+        skin.layout, relative_noise=1e-3, baseline_ohm=skin.rest_ohm, follow_noise=False, prior="discs"
+    )
+    field = posterior.update(frame)
+    deep = truth[..., 2] < -0.25 * np.abs(truth).max()
+    assert (field.displacement_m[deep, 2] < 0.25 * truth[deep, 2]).all()
 
 
 @pytest.mark.parametrize(("name", "height"), [("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0)])

@@ -59,7 +59,7 @@ class EstimateOptions:
         prior: Prior of the loads after the posterior has found a touch: ``cells`` for one variance per cell,
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
-            the loads are not local, ``discs`` falls back to ``cells``. Page "Discs of expected loads".
+            the loads are not local, ``discs`` falls back to ``cells``.
 
     Raises:
         ValueError: If an option is out of range.

@@ -33,6 +33,9 @@ SHARE_MOVED: Final = 3.4
 """Factor by which s is larger for the coordinate that moves farthest."""
 SHARE_RADIUS: Final = 1.4
 """Exponent of the strongest disc's radius in s."""
+SHARE_LEAST_RADIUS: Final = 0.9
+"""Minimum radius in the computation of s, in cells. Without it, the 95 % intervals of small bodies on a thin
+bonded layer contain fewer errors: 80 instead of 81 % in the worst of 16 presses."""
 SHARE_DISC: Final = 1.35
 """Factor by which each further disc increases s. Several discs indicate loads that no single disc fits."""
 SHARE_UNKNOWN: Final = 0.28
@@ -56,8 +59,8 @@ def prior_shares(displacement: Float, unknown: Float, discs: Float) -> Float:
         unknown: (U, f) ratio of b to the prior variance.
         discs: (D, 5) discs, as in :mod:`skinnode.solve.posterior.local.discs`; at least one.
     """
-    radius = math.exp(discs[np.argmax(discs[:, 3]), 2]) / RADIUS
-    share = SHARE * radius**SHARE_RADIUS * SHARE_DISC ** (len(discs) - 1)
+    radius = max(math.exp(discs[np.argmax(discs[:, 3]), 2]), SHARE_LEAST_RADIUS)
+    share = SHARE * (radius / RADIUS) ** SHARE_RADIUS * SHARE_DISC ** (len(discs) - 1)
     square = displacement**2
     moved = square / (square + (MOVED * np.abs(displacement).max()) ** 2 + np.finfo(np.float64).tiny)
     return np.asarray(share * SHARE_MOVED**moved * SHARE_UNKNOWN**unknown)

@@ -200,7 +200,7 @@ class _Search:
         if len(discs):
             noticed = matches[[0, 1], best] ** 2 >= NOTICED * self._unit
             best = best[noticed]
-        return self._p._place[np.unique(best)]
+        return np.asarray(self._p._place[np.unique(best)])
 
     def with_disc_at(self, places: Float, discs: Float) -> tuple[Float, float]:
         """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence."""

@@ -11,7 +11,7 @@ import skinnode as sk
 from skinnode.bench import accuracy_families as families
 from skinnode.bench import family_scenes
 from skinnode.bench.case import preset
-from skinnode.bench.truth import Skin
+from skinnode.bench.truth import Converter, Skin
 from skinnode.solve.posterior.local import discs
 from skinnode.solve.posterior.local.discs import LOADS, Effects
 
@@ -146,6 +146,36 @@ def test_errors_on_a_bonded_layer_are_within_the_claim(skin, family):
         error = np.abs(field.displacement_m - scene.truth_m)
         assert (error <= 6.0 * field.displacement_std_m).all()
         assert (error <= field.half_width_95_m).mean() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("family", "number", "name"), [("ridge", 1001, "staggered"), ("two", 1019, "aligned")]
+)
+def test_a_small_body_on_a_thin_layer_is_found(family, number, name):
+    """The simulator solves the contact. A search for loads on a half-space alone finds no such body."""
+    skin = Skin(preset(name, 0.5))
+    random = np.random.default_rng([number, family_scenes.FAMILIES.index(family)])
+    truth = family_scenes.draw(family, skin, random, bonded=True).truth_m
+    frame, _, _ = Converter(sigma=1e-3).read(skin.resistance_ohm(truth), skin.rest_ohm, random)
+    posterior = sk.Posterior(
+        skin.layout, relative_noise=1e-3, baseline_ohm=skin.rest_ohm, follow_noise=False, prior="discs"
+    )
+    field = posterior.update(frame)
+    deep = truth[..., 2] < -0.25 * np.abs(truth).max()
+    assert (field.displacement_m[deep, 2] < 0.25 * truth[deep, 2]).all()
+
+
+@pytest.mark.parametrize(("name", "height"), [("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0)])
+def test_a_single_electrode_that_the_readings_hardly_show_is_within_the_claim(name, height):
+    """At a noise of 3e-3, a body that moves one electrode by a tenth of the clearance may go unnoticed."""
+    skin = Skin(preset(name, height))
+    random = np.random.default_rng(8)
+    for seed in range(6):
+        truth = np.zeros(skin.layout.upper_m.shape)
+        truth[random.integers(10), random.integers(10), 2] = -0.1 * skin.layout.height_m
+        field = solved(skin, truth, 3e-3, seed)
+        assert (np.abs(field.displacement_m - truth) <= 5.0 * field.displacement_std_m).all()
+        assert field.displacement_std_m.max() < 0.2 * skin.layout.height_m
 
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e-3])

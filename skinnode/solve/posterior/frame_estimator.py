@@ -463,7 +463,7 @@ class FrameEstimator:
         estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
-        std[:, self._free], core[:, self._free] = self._hyper.with_spread(estimator.std, estimator.core)
+        std[:, self._free], core[:, self._free] = self._hyper.with_discs(estimator.std, estimator.core)
         if held.all():  # account for displacements too small for the gate to detect
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
@@ -471,6 +471,7 @@ class FrameEstimator:
             self._force, self._contacts_found = self._contacts.find(
                 self._hyper.loads.estimate(), displacement, (std * pitch).reshape(displacement.shape)
             )
+        std[:, self._free] = self._hyper.with_undetected(std[:, self._free])
         if not held.all():
             self._share = self._data_share()
         used = observation.weight > 0

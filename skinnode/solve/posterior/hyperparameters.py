@@ -15,6 +15,7 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.load_posterior import LoadPosterior
+from skinnode.solve.posterior.local import disc_claim
 from skinnode.solve.posterior.local.disc_search import DiscPrior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
@@ -91,7 +92,7 @@ class Hyperparameters:
         self.discs = discs
         self._rough = False  # whether the discs were fitted only to a field estimated with the uniform prior
         self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
-        self._fixed = scale2
+        self._fixed, self._clearance = scale2, clearance
         self._estimate_noise = estimate_noise
         self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
         self._signal = estimator.signal()
@@ -110,23 +111,31 @@ class Hyperparameters:
         if self.discs is not None:
             self.discs.reset()
 
-    def with_spread(self, std: Float, core: Float) -> tuple[Float, Float]:
+    def with_discs(self, std: Float, core: Float) -> tuple[Float, Float]:
         """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
 
-        ``std`` also accounts for an additional touch that is too light to be detected.
+        ``std`` also accounts for an additional touch of the whole patch that is too light to be detected. See
+        :mod:`skinnode.solve.posterior.local.disc_claim`.
         """
-        if self.discs is None:
+        if self.discs is None or not len(self.discs.discs) or not np.isfinite(std).all():
             return std, core
-        prior = self._prior
+        prior, estimator = self._prior, self._estimator
         spread = self.discs.spread.reshape(std.shape)
-        missed = np.zeros_like(std)
-        known = np.isfinite(std)
-        if len(self.discs.discs):
-            unseen = (std[known] ** 2 - core[known] ** 2) / (prior.doubt - prior.smooth_share)
-            expected = (prior.scale2 * prior.covariance.diagonal()).reshape(std.shape)[known]
-            light = self._least * prior.uniform.diagonal().reshape(std.shape)[known]
-            missed[known] = light * np.minimum(unseen / expected, 1.0)
-        return np.sqrt(std**2 + spread + missed), np.sqrt(core**2 + spread)
+        own = estimator.noise_variance.reshape(std.shape)
+        unseen = (std**2 - core**2) / (prior.doubt - prior.smooth_share)
+        expected = (prior.scale2 * prior.covariance.diagonal()).reshape(std.shape)
+        unknown = np.minimum(unseen / expected, 1.0)
+        light = self._least * prior.uniform.diagonal().reshape(std.shape) * unknown
+        moved = estimator.free_displacement().reshape(std.shape)
+        share = np.minimum(disc_claim.prior_shares(moved, unknown, self.discs.discs), prior.doubt)
+        return np.sqrt(std**2 + spread + light), np.sqrt(own + share * unseen + spread)
+
+    def with_undetected(self, std: Float) -> Float:
+        """Return ``std`` (U, f), in pitches, including a local touch that remains undetected."""
+        if self.discs is None:
+            return std
+        variance = disc_claim.undetected_variance(self._estimator.information(), self._clearance)
+        return np.sqrt(std**2 + variance)
 
     def set_least(self, observation: Observation) -> None:
         """Set the minimum prior scale from the noise of a frame."""

@@ -41,7 +41,8 @@ one of ten dents; with 0.1, in none of 30."""
 DISC_DOUBT: Final = 2.5
 """Value of :data:`PRIOR_DOUBT` for a prior with discs."""
 DISC_SHARE: Final = 0.8
-"""Value of :data:`SMOOTH_SHARE` for a prior with discs."""
+"""Value of :data:`SMOOTH_SHARE` in a solve with discs. The reported 95 % interval uses the factors of
+:mod:`skinnode.solve.posterior.local.disc_claim` instead."""
 DISC_FAINT: Final = 0.05
 """Load variance, relative to that of untouched skin, below which the discs' contribution to a cell is
 neglected."""

@@ -266,6 +266,11 @@ class MapEstimator:
         multiply(np.ascontiguousarray(v.T), v, explained)
         return np.asarray(self.load_prior.scale2 * self.load_prior.covariance - explained)
 
+    def information(self) -> Float:
+        """Return Σ (∂r/∂x)² (U, f), in pitch⁻², from the last linearisation of all wires."""
+        slopes = self._b.jt[:, self._free]
+        return np.asarray(np.einsum("uik,uik->ui", slopes, slopes))
+
     def whiten(self, response: Float, out: Float) -> None:
         """Write L⁻¹ J G into ``out`` (m, C) for the response G (U f, C), using the current factors."""
         b, f, rows = self._b, self._free.size, self._rows

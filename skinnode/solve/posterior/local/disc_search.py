@@ -1,10 +1,11 @@
 """Fits soft load discs to a frame.
 
-The data are linearised at the current displacement, and whitened with the covariance expected on an untouched
-skin, whose loads are equally small everywhere. The first disc is placed where a load matches the whitened
-data best, and is then fitted (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a
-load matches the remaining data best, as long as the gain in evidence outweighs the additional parameters. In
-a stream, the search starts at the discs of the last frame.
+The data are linearised at the current displacement, and whitened with the covariance expected on an
+untouched skin, whose loads are equally small everywhere. The first disc is placed where a load, on a half-
+space or on a thin bonded layer, matches the whitened data best, and is then fitted
+(:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a load matches the remaining
+data best, as long as the gain in evidence outweighs the additional parameters. In a stream, the search
+starts at the discs of the last frame.
 
 No disc is used if equal loads over the whole patch explain the frame better than the discs, or if the loads
 require many or large discs.
@@ -37,6 +38,9 @@ BEYOND: Final = 1
 """Maximum distance of a disc's centre beyond the outermost electrodes, in cells."""
 AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 """Values of ln a, relative to the expected value, at which the search for a new disc starts."""
+SHAPES: Final = ((kernels.RADIUS, kernels.LAYER), (0.6, 4.0))
+"""Radius R in cells and layer share β at which the search for a new disc starts: a contact on a half-space,
+and one on a thin bonded layer, which moves the skin only near the body."""
 REACH: Final = 4.5
 """Radius around the start of a search within which the effects of loads are computed, in cells."""
 MOST: Final = 4
@@ -134,10 +138,10 @@ class DiscPrior:
         discs = search.start(self.discs)
         rejected: tuple[Float, float] | None = None
         while True:
-            place = search.place_of_next(discs)
-            if place is None:
+            places = search.places_of_next(discs)
+            if not len(places):
                 break
-            more, gain = search.with_disc_at(place, discs)
+            more, gain = search.with_disc_at(places, discs)
             excess = gain - PAYS - math.log(PARAMETERS * len(more))
             if not excess > 0.0:
                 rejected = more, excess
@@ -168,7 +172,7 @@ class _Search:
         self._rows = np.empty((len(data), 0))
         self._effects = Effects(np.empty((0, 2)), np.empty((0, 0)), np.empty(0))
         self._match = self._estimator.match(data, prior._response_t)
-        self._unit = 0.0
+        self._unit = np.zeros(2)
         self.evidence = 0.0
 
     def start(self, discs: Float) -> Float:
@@ -178,32 +182,38 @@ class _Search:
         self._include(discs[:, :2])
         return self._climb(discs, 0)
 
-    def place_of_next(self, discs: Float) -> Float | None:
-        """Return the cell (2,) where another disc may be needed; None if no disc is needed."""
+    def places_of_next(self, discs: Float) -> Float:
+        """Return the cells (P, 2) where another disc may be needed; none if no disc is needed.
+
+        One cell is that where a load on a half-space matches the remaining data best, the other that where a
+        load on a bonded layer does.
+        """
         if len(discs) == MOST:
-            return None
+            return np.empty((0, 2))
         left = self._match
         if len(discs):
             q = np.empty(self._effects.match.size)
             kernels.mean_loads(discs, self._effects, self._p._scratch, q)
             left = self._estimator.match(self._data - self._rows @ q, self._p._response_t)
-        square = (self._p._near @ left[2::LOADS]) ** 2
-        best = int(np.argmax(np.where(self._p._inside, square, 0.0)))
-        if len(discs) and square[best] < NOTICED * self._unit:
-            return None
-        return np.asarray(self._p._place[best])
+        matches = np.abs([self._p._near @ left[2::LOADS], left[3::LOADS]])
+        best = np.argmax(np.where(self._p._inside, matches, 0.0), axis=1)
+        if len(discs):
+            noticed = matches[[0, 1], best] ** 2 >= NOTICED * self._unit
+            best = best[noticed]
+        return np.asarray(self._p._place[np.unique(best)])
 
-    def with_disc_at(self, place: Float, discs: Float) -> tuple[Float, float]:
-        """Return ``discs`` with another disc near ``place``, and the resulting gain in evidence."""
+    def with_disc_at(self, places: Float, discs: Float) -> tuple[Float, float]:
+        """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence."""
         p, before = self._p, self.evidence
-        self._include(place[None])
+        self._include(places)
         if not len(discs):
-            near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._cells]
-            self._unit = float(near @ self._effects.gram[2::LOADS, 2::LOADS] @ near)
+            near = p._near[np.argmin(((p._place - places[0]) ** 2).sum(axis=1))][self._cells]
+            gram = self._effects.gram
+            self._unit[:] = near @ gram[2::LOADS, 2::LOADS] @ near, gram.diagonal()[3::LOADS].max()
         trials = [
-            np.vstack(
-                [discs, [*place, math.log(kernels.RADIUS), p._amplitude + more, math.log(kernels.LAYER)]]
-            )
+            np.vstack([discs, [*place, math.log(radius), p._amplitude + more, math.log(layer)]])
+            for place in places
+            for radius, layer in SHAPES
             for more in AMPLITUDES
         ]
         first = max(trials, key=lambda trial: kernels.evidence(trial, self._effects, p._scratch))

@@ -11,7 +11,7 @@ import typer
 
 from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
 from skinnode.cli._publish import AskedPublication, Commands, Listen, Publish, asked_publication
-from skinnode.cli._zenoh_options import Router, ZenohConfig, ZenohOptions, ZenohPort
+from skinnode.cli._zenoh_options import Router, ZenohConfig, ZenohOptions
 
 if TYPE_CHECKING:
     from skinnode.cli._run_report import Report
@@ -34,7 +34,15 @@ def host(
     listen: Listen = None,
     router: Router = None,
     zenoh_config: ZenohConfig = None,
-    zenoh_port: ZenohPort = None,
+    zenoh_port: Annotated[
+        int | None,
+        typer.Option(
+            "--zenoh-port",
+            "--port",
+            help="First of the 16 ports of daemons on this machine; default 17447.",
+            metavar="PORT",
+        ),
+    ] = None,
 ) -> None:
     """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
 

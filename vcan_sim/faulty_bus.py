@@ -44,16 +44,6 @@ class FaultyPort(CanPort):
         super().send(can_id, data, remote=remote)
         self.passed.sent[kind_of(can_id, data, remote)] += 1
 
-    @property
-    def takes_bursts(self) -> bool:
-        """Whether :meth:`send_burst` may be called."""
-        return not self.off and super().takes_bursts
-
-    def send_burst(self, can_id: int, payloads: Sequence[bytes]) -> None:
-        """Send several frames with the same identifier. Call it only if :attr:`takes_bursts`."""
-        super().send_burst(can_id, payloads)
-        self.passed.sent[kind_of(can_id, payloads[0])] += len(payloads)
-
     def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
         """Receive a batch of frames. Raises BusError if the controller is bus-off."""
         if self.off:
@@ -96,7 +86,7 @@ class FaultyBus:
             data_bps = self._config.data_bitrate_bps if self._config.fd else None
             rates = BitRates(self._config.bitrate_bps, data_bps)
             self._segment = segment(self._config.channel, virtual, rates)
-            self._segment.error_listeners.append(self._on_event)
+            self._segment.listeners.append(self._on_event)
         self._apply()
 
     def stop(self) -> None:
@@ -106,7 +96,7 @@ class FaultyBus:
             self._attacker = None
         if self._segment is not None:
             self._disturb(0.0)
-            self._segment.error_listeners.remove(self._on_event)
+            self._segment.listeners.remove(self._on_event)
             self._segment = None
         self._port = None
 

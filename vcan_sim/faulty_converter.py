@@ -10,7 +10,7 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.node.patch.source import ResistanceSource, conversions_of
 from skinnode.protocol.codes import CodeScale, encode
-from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults
+from vcan_sim.faults import OF_WIRES, Faults
 from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
@@ -62,11 +62,6 @@ class FaultyConverter:
 
     def read(self, t_ns: int) -> Float:
         """Return the resistances (U, K) at ``t_ns`` in ohms. A frozen converter repeats its last reading."""
-        if self._injector.faults is NO_FAULTS:
-            self._drift, self._drifted_to_ns, self._held = 0.0, 0, {}
-            self._reading = self._source.read(t_ns)
-            self._conversions = conversions_of(self._source)
-            return self._reading
         self._injector.injected.uncounted += self._injector.faults.uncounted
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1

@@ -6,7 +6,7 @@ faults in scans. All faults other than periodic events are determined by a seed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Final, Protocol
 
 import numpy as np
@@ -66,17 +66,6 @@ class Emit(Protocol):
         """Put a frame on the bus. Raises BusError if the bus rejects the frame."""
 
 
-class Bursts(Protocol):
-    """Port that can put several frames on the bus at once, such as :class:`skinnode.transport.CanPort`."""
-
-    @property
-    def takes_bursts(self) -> bool:
-        """Whether :meth:`send_burst` may be called; then, it does not raise an exception."""
-
-    def send_burst(self, can_id: int, payloads: Sequence[bytes]) -> None:
-        """Put several frames with the same identifier on the bus."""
-
-
 class FaultyNode(PatchNode):
     """:class:`PatchNode` with injected faults. Any thread may assign :attr:`faults` at any time.
 
@@ -85,8 +74,7 @@ class FaultyNode(PatchNode):
         layout: Layout of the patch.
         source: Source of the resistances that the converter reads.
         emit: Function that puts a frame on the bus.
-        on_sent: Function called with the COB-ID of outgoing frames and their number, even if they are lost.
-        bursts: Port for several frames at once; None to send all frames one by one.
+        on_sent: Function called with the COB-ID of each outgoing frame, even if the frame is lost.
         serial: Serial number.
         profile: Protocol profile of the node.
         faults: Initial faults. Their seed remains in use when the faults are replaced.
@@ -100,8 +88,7 @@ class FaultyNode(PatchNode):
         source: ResistanceSource,
         *,
         emit: Emit,
-        on_sent: Callable[[int, int], None],
-        bursts: Bursts | None = None,
+        on_sent: Callable[[int], None],
         serial: int,
         profile: PatchProfile,
         faults: Faults = NO_FAULTS,
@@ -109,7 +96,7 @@ class FaultyNode(PatchNode):
     ) -> None:
         self._injector = Injector(faults, node_id)
         self._periods_ns = _periods_ns(faults)
-        self._emit, self._on_sent, self._bursts = emit, on_sent, bursts
+        self._emit, self._on_sent = emit, on_sent
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
         self._faulty_scans = FaultyScans(
             self._injector,
@@ -123,7 +110,6 @@ class FaultyNode(PatchNode):
         self._twin: PatchNode | None = None
         self._layout, self._serial = layout, serial
         self._due_ns = dict.fromkeys(("restart", "emcy", "babble"), 0)
-        self._afflicted = True  # whether a fault acts on the node, or may still have to be ended
         self.converter = FaultyConverter(
             source,
             self._injector,
@@ -171,13 +157,6 @@ class FaultyNode(PatchNode):
             self._twin.on_frame(can_id, data, t_ns, remote)
 
     def _hear(self, can_id: int, data: bytes, t_ns: int, remote: bool) -> None:
-        if not self._afflicted and self._injector.faults is NO_FAULTS:
-            kind, tally = kind_of(can_id, data, remote), self._injector.tally
-            tally.heard[kind] += 1
-            tally.taken[kind] += 1
-            super().on_frame(can_id, data, t_ns, remote)
-            return
-        self._afflicted = True
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
         kind = kind_of(can_id, data, remote)
@@ -206,10 +185,6 @@ class FaultyNode(PatchNode):
 
     def on_timer(self, t_ns: int) -> None:
         """Process the timers and periodic events that are due at ``t_ns``."""
-        if not self._afflicted and self._injector.faults is NO_FAULTS:
-            super().on_timer(t_ns)
-            return
-        self._afflicted = True
         self._meet_twin(t_ns)
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
@@ -222,18 +197,10 @@ class FaultyNode(PatchNode):
         super().on_timer(t_ns)
         self._reset_if_due(t_ns)
         self._do_due_events(t_ns)
-        self._afflicted = self._is_afflicted()
-
-    def _is_afflicted(self) -> bool:
-        """Return whether a fault acts on the node, or has to be ended."""
-        acts = self._unplugged or self._passive or self._stormed or self._faulty_scans.reset_due
-        return acts or self._twin is not None or self.faults is not NO_FAULTS or any(self._due_ns.values())
 
     def next_deadline_ns(self) -> int | None:
         """Return the time (ns) at which to call :meth:`on_timer` next; None if nothing is due."""
-        faults = self._injector.faults
-        if not self._afflicted and faults is NO_FAULTS:
-            return super().next_deadline_ns()
+        faults = self.faults
         if faults.unplugged != self._unplugged or faults.duplicate_node_id != (self._twin is not None):
             return 0
         own = None if self._unplugged else self._own_deadline_ns(faults)
@@ -333,9 +300,7 @@ class FaultyNode(PatchNode):
     # --- frames sent by the node
 
     def _out(self, can_id: int, data: bytes) -> None:
-        if can_id == self._summary_id and self._faulty_scans.passes_summary(data) and not self._is_cut_off:
-            self._pass_summary(data)
-        elif can_id == self._chunk_id:
+        if can_id == self._chunk_id:
             self._injector.tally.handed[Kind.CHUNK] += 1
             self._faulty_scans.send_chunk(data)
         elif can_id == self._summary_id:
@@ -343,43 +308,7 @@ class FaultyNode(PatchNode):
             self._faulty_scans.send_summary(data)
         else:
             self._put_or_lose(can_id, self._imposture(can_id, data))
-        self._on_sent(can_id, 1)
-
-    def _send_all(self, can_id: int, payloads: Iterator[bytes]) -> None:
-        """Send chunks, all at once if no fault can affect any of them and the port accepts bursts."""
-        first = next(payloads, None)
-        if first is None:
-            return
-        bursts = self._bursts
-        if (
-            can_id == self._chunk_id
-            and bursts is not None
-            and bursts.takes_bursts
-            and self._faulty_scans.passes(first)
-            and not self._is_cut_off
-        ):
-            chunks, tally = [first, *payloads], self._injector.tally
-            count = len(chunks)
-            tally.handed[Kind.CHUNK] += count
-            self._faulty_scans.pass_all(count)
-            bursts.send_burst(can_id, chunks)
-            tally.emitted[Kind.CHUNK] += count
-            self._on_sent(can_id, count)
-            return
-        self._out(can_id, first)
-        super()._send_all(can_id, payloads)
-
-    def _pass_summary(self, data: bytes) -> None:
-        """Put a summary on the bus that no fault can affect."""
-        tally = self._injector.tally
-        tally.handed[Kind.SUMMARY] += 1
-        try:
-            self._emit(self._summary_id, data)
-        except BusError:
-            tally.refused[Kind.SUMMARY] += 1
-            raise
-        tally.emitted[Kind.SUMMARY] += 1
-        self._injector.injected.pdos += 1
+        self._on_sent(can_id)
 
     def _put_or_lose(self, can_id: int, data: bytes) -> bool:
         """Send a non-PDO frame unless a fault drops it, and return whether it was sent."""

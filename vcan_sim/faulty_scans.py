@@ -101,25 +101,6 @@ class FaultyScans:
         finally:  # send the swapped chunk even if the bus rejects this one
             self._release([] if swapped is None else [swapped])
 
-    def passes(self, data: bytes) -> bool:
-        """Return whether a chunk, and those of the same scan sent at the same time, pass without a fault."""
-        return self._is_intact(data[_CHUNK_COUNTER_BYTE])
-
-    def passes_summary(self, data: bytes) -> bool:
-        """Return whether a summary passes without a fault."""
-        return self._is_intact(data[_SUMMARY_COUNTER_BYTE]) and self._swapped is None
-
-    def _is_intact(self, counter: int) -> bool:
-        """Return whether no fault of this scan or an earlier scan affects the scan with this counter."""
-        if counter != self._counter:
-            self._begin_scan(counter)
-        return self._intact and not self._late and self._injector.faults is NO_FAULTS
-
-    def pass_all(self, chunks: int) -> None:
-        """Count chunks that :meth:`passes` has allowed to be sent at once."""
-        self._chunks += chunks
-        self._injector.injected.pdos += chunks
-
     def send_summary(self, data: bytes) -> None:
         """Apply the scan fault to a summary, and send it."""
         injected, tally = self._injector.injected, self._injector.tally

@@ -21,7 +21,7 @@ from vcan_sim.default_scene import Scene
 from vcan_sim.fault_player import FaultPlayer
 from vcan_sim.faults import NO_FAULTS, Faults, Injected, check_wires
 from vcan_sim.faulty_bus import FaultyBus, FaultyPort, Passed
-from vcan_sim.faulty_node import FaultyNode
+from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.fleet_faults import FleetFaults, Places
 from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene, schedule_of
 from vcan_sim.sensor import SimulatedPatch, SkinMotion
@@ -166,7 +166,7 @@ class Fleet:
                 opened.callback(self._segments[bus.name].stop)
                 self._segments[bus.name].connect(port)
                 stations = [self._stations[patch.name] for patch in self.hand.patches_on(bus.name)]
-                runner = NodeRunner(port, [station.connect(port) for station in stations])
+                runner = NodeRunner(port, [station.connect(port.send) for station in stations])
                 runner.start()
                 opened.callback(runner.stop)
                 runners.append(runner)
@@ -377,16 +377,15 @@ class _Station:
         self._faults = Faults(seed=seed)
         self._frames = self._pdos = 0
 
-    def connect(self, port: FaultyPort) -> FaultyNode:
-        """Create the node of the patch, which sends its frames through ``port``."""
+    def connect(self, emit: Emit) -> FaultyNode:
+        """Create the node of the patch, which sends its frames through ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,
             self.source.scene.layout,
             self._converter,
-            emit=port.send,
+            emit=emit,
             on_sent=self._on_sent,
-            bursts=port,
             serial=config.node_id if config.serial is None else config.serial,
             profile=self._profile,
             faults=self._faults,
@@ -408,10 +407,9 @@ class _Station:
     def tally(self) -> Tally:
         return Tally() if self._node is None else self._node.tally
 
-    def _on_sent(self, can_id: int, count: int) -> None:
-        self._frames += count
-        if can_id in self._pdo_ids:
-            self._pdos += count
+    def _on_sent(self, can_id: int) -> None:
+        self._frames += 1
+        self._pdos += can_id in self._pdo_ids
         source, node = self.source, self._node
         if not source.started and node is not None and node.scans_sent:
             self._begin(source)

@@ -6,12 +6,11 @@ Endpoints with the same channel and the same virtual clock are stations on one
 
 from __future__ import annotations
 
-import itertools
 import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any, Final, cast
 
 import can
@@ -57,22 +56,16 @@ class Inbox:
         """Time (ns) before which new frames do not wake the reader."""
         return self._quiet_until_ns
 
-    def put(self, delivered: Sequence[Delivered]) -> None:
-        """Append frames, and wake the reader immediately or at :attr:`quiet_until_ns`.
-
-        As if the frames had been appended one by one, the first frame may wake the reader immediately, and
-        the next frame wakes it at the end of the interval.
-        """
-        count = len(delivered)
-        if not self._due and self._clock.now_ns >= self._quiet_until_ns:
-            self._queue.store(delivered[:1])
+    def put(self, delivered: Delivered) -> None:
+        """Append a frame, and wake the reader immediately or at :attr:`quiet_until_ns`."""
+        self._queue.store(delivered)
+        if self._due:
+            return
+        if self._clock.now_ns >= self._quiet_until_ns:
             self._wake()
-            delivered, count = delivered[1:], count - 1
-        if count:
-            self._queue.store(delivered)
-            if not self._due:
-                self._due = True
-                self._clock.call_at(self._quiet_until_ns, self._wake)
+        else:
+            self._due = True
+            self._clock.call_at(self._quiet_until_ns, self._wake)
 
     def get(self, timeout_s: float | None) -> Delivered:
         """Return the next frame. Raises :class:`queue.Empty` if no frame arrives within the time-out."""
@@ -80,15 +73,11 @@ class Inbox:
 
     def get_all(self, timeout_s: float, most: int) -> list[Delivered]:
         """Return up to ``most`` frames, after waiting up to ``timeout_s`` for the first one."""
-        waiting = self._queue.queue
-        if not waiting and timeout_s <= 0.0:
-            self._clock.monotonic_ns()  # counts as a clock reading, because the thread may be polling
-            if not waiting:
-                return []
         try:
             frames = [self.get(timeout_s)]
         except queue.Empty:
             return []
+        waiting = self._queue.queue
         frames += [waiting.popleft() for _ in range(min(len(waiting), most - 1))]
         return frames
 
@@ -112,7 +101,6 @@ class Segment:
 
     Attributes:
         listeners: Functions called with each event on the bus.
-        error_listeners: Functions called with each event except the delivery of a frame.
     """
 
     def __init__(self, channel: str, clock: VirtualClock, rates: BitRates) -> None:
@@ -122,7 +110,6 @@ class Segment:
         for station in range(MOST_STATIONS):
             self.bus.disconnect(now_ns, station)
         self.listeners: list[Callable[[Event], None]] = []
-        self.error_listeners: list[Callable[[Event], None]] = []
         self._inboxes: list[Inbox] = []
         self._leaving: set[int] = set()
         self._connected: set[int] = set()
@@ -150,12 +137,6 @@ class Segment:
         """Queue a frame from a station for transmission."""
         self.bus.send(self.clock.now_ns, station, frame)
         if self._due_ns is None or self.bus.waiting(station) == 1:  # otherwise, already planned
-            self._plan()
-
-    def send_all(self, station: int, frames: Sequence[CanFrame]) -> None:
-        """Queue several frames with the same identifier from a station, like :meth:`send`."""
-        self.bus.send_all(self.clock.now_ns, station, frames)
-        if self._due_ns is None or self.bus.waiting(station) == len(frames):  # otherwise, already planned
             self._plan()
 
     def disturb(self, rule: Disturbance) -> None:
@@ -207,26 +188,16 @@ class Segment:
 
     def _deliver(self) -> None:
         self._due_ns = None
-        events, inboxes = self.bus.advance(self.clock.now_ns), self._inboxes
-        for receivers, run in itertools.groupby(events, _receivers_of):
-            if receivers:
-                frames = cast("list[Delivered]", list(run))
-                for station in receivers:
-                    inboxes[station].put(frames)
-            elif self.error_listeners:
-                self._report(run)
-        for listener in self.listeners:
-            for event in events:
+        inboxes, listeners = self._inboxes, self.listeners
+        for event in self.bus.advance(self.clock.now_ns):
+            if isinstance(event, Delivered):
+                for station in event.receivers:
+                    inboxes[station].put(event)
+            for listener in listeners:
                 listener(event)
         if self._leaving:
             self._disconnect()
         self._plan()
-
-    def _report(self, events: Iterable[Event]) -> None:
-        for event in events:
-            if not isinstance(event, Delivered):
-                for listener in self.error_listeners:
-                    listener(event)
 
     def _disconnect(self) -> None:
         """Disconnect the closing stations that have sent their frames, or all stations if all are closing."""
@@ -236,10 +207,6 @@ class Segment:
                 self.bus.disconnect(self.clock.now_ns, station)
                 self._leaving.remove(station)
                 self._connected.remove(station)
-
-
-def _receivers_of(event: Event) -> tuple[int, ...]:
-    return event.receivers if isinstance(event, Delivered) else ()
 
 
 def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
@@ -350,12 +317,6 @@ class TimedInterface(can.BusABC):
         """Queue a frame for transmission. See :class:`FrameInterface` for the arguments."""
         self._check_open()
         self._segment.send(self._station, CanFrame(can_id, data, False, remote, 0, fd, fd))
-
-    def send_burst(self, can_id: int, payloads: Sequence[bytes], *, fd: bool) -> None:
-        """Queue several frames for transmission. See :class:`BurstInterface` for the arguments."""
-        self._check_open()
-        frames = [CanFrame(can_id, data, False, False, 0, fd, fd) for data in payloads]
-        self._segment.send_all(self._station, frames)
 
     def read_frames(self, timeout_s: float, most: int) -> list[Frame]:
         """Return up to ``most`` received frames, without applying the python-can filters."""

@@ -22,7 +22,7 @@ import os
 import queue as queues
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from types import TracebackType
 from typing import Any, Final, Self, cast
@@ -376,9 +376,9 @@ class _Queue:
 class Mailbox(_Queue):
     """Queue whose reader can be woken separately, after several items have been stored."""
 
-    def store(self, items: Sequence[Any]) -> None:
-        """Append items without waking the reader. Call :meth:`wake` later."""
-        self.queue.extend(items)
+    def store(self, item: Any) -> None:
+        """Append an item without waking the reader. Call :meth:`wake` later."""
+        self.queue.append(item)
 
     def wake(self) -> None:
         """If the queue has items, wake the thread that has been waiting longest."""

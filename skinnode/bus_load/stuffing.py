@@ -7,7 +7,6 @@ and the simulator of a kernel bus do not count bits, so they need not load numba
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from types import ModuleType
 from typing import Final
 
@@ -139,11 +138,4 @@ def classic_frame_bits(head: int, data: bytes) -> int:
     # The data are passed in two halves, because numba would recompile the kernel for numbers of 2⁶³ or
     # more.
     word = int.from_bytes(data, "big")
-    classic_one, crc_of, run_of = _classic_one()
-    return int(classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, crc_of, run_of))
-
-
-@functools.cache
-def _classic_one() -> tuple[Callable[..., int], NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return the kernel for a single classic frame, and its tables."""
-    return _kernels().classic_one, *_arrays()
+    return int(_kernels().classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, *_arrays()))

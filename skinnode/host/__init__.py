@@ -12,8 +12,7 @@ receive queue, reopening) and a ``served_bus``. Each patch has a ``patch_stream`
 
     start (brings up all nodes) -> remote_node -> configurator (configures one node), sdo_client, lss_master
     supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch
-    node_monitor (evidence about a node) -> health (condition) -> health_memory (what may have changed)
-        -> health_watch -> events
+    node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
     publish -> touch_changes (onsets and releases) -> health_watch -> events
 
 Other modules send SYNC (``sync``) and NMT commands (``nmt_master``), contain exceptions (``containment``),

@@ -269,11 +269,6 @@ class Dispatcher:
             load=self._load,
         )
 
-    @property
-    def incidents(self) -> tuple[object, ...]:
-        """Counters and states that do not change on a healthy bus."""
-        return self._foreign, self._malformed, self._error_frames, self._bus_offs, self._bus_state
-
     def _on_error_frame(self, frame: Frame) -> None:
         self._error_frames += 1
         if self.config.interface == "socketcan":  # only SocketCAN encodes the controller state in this way

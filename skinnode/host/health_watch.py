@@ -58,9 +58,8 @@ class HealthWatch:
     thread, the caller calls :meth:`check`.
 
     Args:
-        patches: Function that returns the health of each patch. If it returns the same object again, nothing
-            has changed except ages.
-        buses: Function that returns the health of each bus, likewise.
+        patches: Function that returns the health of each patch.
+        buses: Function that returns the health of each bus.
         events: Destination of the published changes.
         defects: Collector of the exceptions.
         all_defects: Function that returns the statistics of all contained exceptions.
@@ -85,7 +84,6 @@ class HealthWatch:
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
         # (subject, counter) -> time and counter value of the last event
         self._reported: dict[tuple[str, str], tuple[int, int]] = {}
-        self._held_back: set[tuple[str, str]] = set()  # counters whose last change has not been published yet
         self._stop = clock.event()
         self._thread = clock.thread(target=self._run, name="health")
 
@@ -131,25 +129,18 @@ class HealthWatch:
 
     def _check_patches(self) -> None:
         for name, health in self._patches().items():
-            before = self._patch_before[name]
-            if health is before and not self._held_back:
-                continue
-            self._compare_patch(name, before, health)
+            self._compare_patch(name, self._patch_before[name], health)
             self._patch_before[name] = health
 
     def _check_buses(self) -> None:
         for name, bus in self._buses().items():
-            before = self._bus_before[name]
-            if bus is before and not self._held_back:
-                continue
-            self._compare_bus(name, before, bus)
+            self._compare_bus(name, self._bus_before[name], bus)
             self._bus_before[name] = bus
 
     def _check_defects(self) -> None:
         words = ("defect of the host", "defects of the host")
         for name, stats in self._all_defects().items():
-            if stats.count:
-                self._compare_count(name, "defects", (0, stats.count), words, f", last {stats.newest}")
+            self._compare_count(name, "defects", (0, stats.count), words, f", last {stats.newest}")
 
     def _compare_bus(self, name: str, before: BusHealth, now: BusHealth) -> None:
         if now.away != before.away:
@@ -211,15 +202,9 @@ class HealthWatch:
     ) -> None:
         before, count = counts
         when_ns, reported = self._reported.get((name, counter), (0, before))
-        if count <= reported:
-            return
-        t_ns = self._now_ns()
-        if t_ns - when_ns <= _QUIET_NS:
-            self._held_back.add((name, counter))
-            return
-        self._reported[name, counter] = t_ns, count
-        self._held_back.discard((name, counter))
-        self._publish(name, counter, f"{counted(count - reported, *words)}{detail}")
+        if count > reported and (t_ns := self._now_ns()) - when_ns > _QUIET_NS:
+            self._reported[name, counter] = t_ns, count
+            self._publish(name, counter, f"{counted(count - reported, *words)}{detail}")
 
     def _publish(self, subject: str, what: str, text: str) -> None:
         self._events.publish(HealthEvent(self._now_ns(), subject, what, text))

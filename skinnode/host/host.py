@@ -15,7 +15,6 @@ from skinnode.host.configurator import BOOT_DEADLINE_S
 from skinnode.host.containment import DefectStats
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.health import BusHealth, PatchHealth, faults_of
-from skinnode.host.health_memory import HealthMemory
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.lifecycle import HostParts, StartOptions, never, running_parts
 from skinnode.host.other_masters import OtherMasterStats
@@ -165,8 +164,8 @@ class Host(RunningHand):
         with running_parts(hand, options) as parts:
             host = cls(parts)
             with HealthWatch(
-                HealthMemory(parts.nodes, host._facts, host.health),
-                HealthMemory(parts.buses, host._bus_facts, host.bus_health),
+                host._all_health,
+                host._all_bus_health,
                 parts.events,
                 parts.defects,
                 host._all_defects,
@@ -216,20 +215,11 @@ class Host(RunningHand):
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
         return bool(self.hand.sync.counter_overflow) or not any(each.stats().offered for each in streams)
 
-    def _facts(self, patch: str) -> object | None:
-        """Return everything that determines the health of an operational patch, apart from ages."""
-        node = self._nodes[patch]
-        monitor, stream = node.monitor, node.stream
-        if not monitor.is_inconspicuous(
-            clock.monotonic_ns(), node.heartbeat_s, self.hand.sync.period_s, stream.t_passed_ns
-        ):
-            return None
-        return monitor.counts, stream.conflicts, faults_of(self._publisher.latest(patch))
+    def _all_health(self) -> dict[str, PatchHealth]:
+        return {patch: self.health(patch) for patch in self._nodes}
 
-    def _bus_facts(self, bus: str) -> object:
-        """Return everything that determines the health of a bus, apart from its load."""
-        served = self._buses[bus]
-        return served.facts, self._lacks_sync(served)
+    def _all_bus_health(self) -> dict[str, BusHealth]:
+        return {bus: self.bus_health(bus) for bus in self._buses}
 
     def _all_defects(self) -> dict[str, DefectStats]:
         of_buses = [bus.link.defects for bus in self._buses.values()]

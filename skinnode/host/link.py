@@ -168,12 +168,6 @@ class BusLink(Dispatcher, Closing):
             )
         )
 
-    @property
-    def incidents(self) -> tuple[object, ...]:
-        """Counters and states of :meth:`stats` that do not change on a healthy bus."""
-        port, intake = self._port, self.intake
-        return (*super().incidents, intake.dropped, port.dropped, self._outages)
-
     def close(self) -> None:
         """Close the interface. Call only after the mainline has ended."""
         self._port.close()

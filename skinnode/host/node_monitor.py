@@ -239,34 +239,6 @@ class NodeMonitor:
             and scan_age_s <= SCANS_MISSED * scan_s,
         )
 
-    def is_inconspicuous(
-        self, now_ns: int, heartbeat_s: float, scan_s: float, t_passed_ns: int | None = None
-    ) -> bool:
-        """Return whether the patch is operational, without signs of a restart loop or a second node.
-
-        If so, :meth:`health` with the same arguments gives the condition *operational*, but takes longer.
-        """
-        heard_ns = self._t_heartbeat_ns
-        passed_ns = self._t_scan_ns if t_passed_ns is None else t_passed_ns or None
-        if heard_ns is None or passed_ns is None or self.nmt_state != NmtState.OPERATIONAL:
-            return False
-        if self.refusal is not None or self.defect is not None or self._error_register:
-            return False
-        if self._restarts or (self._watch is not None and self._watch.frozen):
-            return False
-        if max(0, now_ns - heard_ns) * 1e-9 / heartbeat_s > HEARTBEATS_MISSED:
-            return False
-        if max(0, now_ns - passed_ns) * 1e-9 / scan_s > SCANS_MISSED:
-            return False
-        return not self._beats_too_often(now_ns, heartbeat_s)
-
-    @property
-    def counts(self) -> tuple[object, ...]:
-        """Counters and parts of the health that are compared to find changes, apart from its condition."""
-        watch = self._watch
-        wires = () if watch is None else watch.wires
-        return self._boot_ups, self._emergencies, self.rejoins, self.baselines, wires
-
     def _emergency_text(self, code: int, detail: bytes) -> str:
         """Return the description of an EMCY message.
 

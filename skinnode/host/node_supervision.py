@@ -60,14 +60,14 @@ class NodeSupervision:
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
         match node.phase:
-            case Phase.RUNNING:  # first, because most nodes are running
-                self._watch(node, now_ns)
             case Phase.AWAITED:
                 self._await(node, now_ns)
             case Phase.JOINING:
                 self._join(node, now_ns)
             case Phase.STARTING:
                 self._starting(node, now_ns)
+            case Phase.RUNNING:
+                self._watch(node, now_ns)
 
     def _await(self, node: Supervised, now_ns: int) -> None:
         remote, monitor = node.remote, node.remote.monitor

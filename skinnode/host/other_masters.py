@@ -45,7 +45,6 @@ class OtherMasters:
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
         self._counts = dict.fromkeys((SYNC, NMT, SDO, HEARTBEAT), 0)
-        self._count = 0
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
@@ -73,14 +72,8 @@ class OtherMasters:
         last_ns = max(self._last_ns.values(), default=None)
         return OtherMasterStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)
 
-    @property
-    def count(self) -> int:
-        """Number of frames from other masters. Thread-safe."""
-        return self._count
-
     def _on(self, what: str, t_ns: int) -> None:
         self._counts[what] += 1
-        self._count += 1
         before_ns = self._last_ns.get(what)
         self._last_ns[what] = t_ns
         expected = self._bus.role == "guest" and what == SDO

@@ -182,8 +182,7 @@ class PatchStream:
 
     def poll(self, t_ns: int) -> None:
         """End the current scan at its deadline, and check earlier scans for faulty wires."""
-        if self._unwatched and t_ns >= self._unwatched[0][0]:
-            self._watch_until(t_ns)
+        self._watch_until(t_ns)
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
             return

@@ -45,11 +45,6 @@ class ServedBus:
             no_sync=no_sync,
         )
 
-    @property
-    def facts(self) -> tuple[object, ...]:
-        """Everything that determines :meth:`health`, apart from the load; quicker to compare."""
-        return self.link.failure, self.link.incidents, self.other_masters.count
-
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
         """Return whether another master's SYNC has been missing for :data:`SYNCS_MISSED` periods.
 

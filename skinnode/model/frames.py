@@ -228,15 +228,13 @@ def sealed(record: _Record, **changes: Any) -> _Record:
 
     The copy's arrays are views; the original arrays remain writable. Several readers can share the copy.
     """
-    kind = type(record)
-    twin, slots = object.__new__(kind), _SLOTS[kind]
-    values = dict(zip(slots, _VALUES[kind](record), strict=True))
-    values.update(changes)
-    for name, value in values.items():
+    twin = _copy(record, changes)
+    slots = _SLOTS[type(record)]
+    for name, value in zip(slots, _VALUES[type(record)](twin), strict=True):
         if isinstance(value, np.ndarray) and value.flags.writeable:
             value = value.view()
             value.flags.writeable = False
-        slots[name](twin, value)
+            slots[name](twin, value)
     return twin
 
 

@@ -10,7 +10,7 @@ and from ``send`` propagate to the caller.
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from skinnode.canopen import indices as od
@@ -87,7 +87,7 @@ class CanopenDevice:
         self._sdo = SdoServer(self._store, self._send_sdo)
         self._rejected = RejectedFrames(self._store)
         self._emcy = EmcyProducer(self._store, send)
-        services = NodeServices(self._store, self._emcy, self._rejected, send, self._send_all, self._now)
+        services = NodeServices(self._store, self._emcy, self._rejected, send, self._now)
         self._nmt = NmtSlave(self._store, self._rejected, self._entered)
         self._storage = Storage(services, memory, kind)
         self._set_bit_rate = set_bit_rate
@@ -179,7 +179,7 @@ class CanopenDevice:
         """Return the time (ns) at which :meth:`on_timer` must be called, or None if nothing is scheduled."""
         if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
             return self._bit_rate_change.deadline_ns
-        if self._nmt.state is NmtState.INITIALISING:
+        if self.nmt_state is NmtState.INITIALISING:
             return None
         deadline_ns = min(
             self._sync.deadline_ns,
@@ -222,11 +222,6 @@ class CanopenDevice:
 
     def _now(self) -> int:
         return self._now_ns
-
-    def _send_all(self, can_id: int, payloads: Iterator[bytes]) -> None:
-        """Send several frames with the same COB-ID. A simulated node overrides this method."""
-        for payload in payloads:
-            self._send(can_id, payload)
 
     # --- states
 

@@ -67,13 +67,7 @@ class ErrorControl:
     def deadline_ns(self) -> int:
         """Time (ns) at which :meth:`on_timer` must be called next."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
-        return min(
-            boot_up_ns,
-            self._producer.deadline_ns,
-            self._guarding.deadline_ns,
-            self._consumer.deadline_ns,
-            self._rival_until_ns,
-        )
+        return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
     @property
     def silent_from_ns(self) -> int:
@@ -114,8 +108,6 @@ class ErrorControl:
 
     def on_timer(self, state: NmtState, t_ns: int) -> None:
         """Perform all actions due at ``t_ns``."""
-        if t_ns < self.deadline_ns:
-            return
         self._send_boot_up()
         if self._producer.beat(t_ns):
             self._send(self._cob_id, bytes((state,)))

@@ -181,11 +181,8 @@ class NodeRunner:
         nodes, now = self.nodes, clock.monotonic_ns
         # All nodes are given the same time, so that one wake-up serves nodes that were started together.
         now_ns, first_ns = now(), NO_DEADLINE_NS
-        failure: BusError | None = None
-        for node in nodes:
-            if now_ns >= node.silent_from_ns:
-                failure = self._catch_up(now_ns)
-                break
+        silent = any(now_ns >= node.silent_from_ns for node in nodes)
+        failure = self._catch_up(now_ns) if silent else None
         for number, node in enumerate(nodes):
             # A frame may have postponed the deadline since the last turn. The call to on_timer() then has no
             # effect, which costs less than querying every deadline again.

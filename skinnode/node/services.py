@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from skinnode.node.emcy import EmcyProducer
@@ -12,12 +12,6 @@ from skinnode.node.rejected import RejectedFrames
 
 Send = Callable[[int, bytes], None]
 """Callback that sends a frame, given its COB-ID and payload."""
-
-SendAll = Callable[[int, Iterator[bytes]], None]
-"""Callback that sends several frames, given their COB-ID and payloads.
-
-It takes the next payload only after the bus has accepted the previous one.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +26,5 @@ class NodeServices:
     """Counters of rejected frames (0x2040)."""
     send: Send
     """Function that sends a frame."""
-    send_all: SendAll
-    """Function that sends several frames with the same COB-ID."""
     now: Clock
     """Function that returns the time (ns) of the event being handled."""

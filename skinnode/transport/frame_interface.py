@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from skinnode.transport.frame import Frame
@@ -54,18 +54,3 @@ class SignallingInterface(FrameInterface, Protocol):
     def hold_until(self, t_ns: int) -> None:
         """Defer announcements until monotonic time ``t_ns``, so that frames are fetched together."""
         ...
-
-
-@runtime_checkable
-class BurstInterface(FrameInterface, Protocol):
-    """Interface that accepts several frames at once and rejects none of them while it is open.
-
-    On a simulated bus, sending the chunks of a scan one by one would take longer than simulating the bus.
-    """
-
-    def send_burst(self, can_id: int, payloads: Sequence[bytes], *, fd: bool) -> None:
-        """Queue several frames with the same 11-bit identifier. CAN FD frames use bit rate switching.
-
-        Raises:
-            can.CanError or OSError: if the interface is closed. Then, no frame has been queued.
-        """

@@ -11,7 +11,6 @@ import difflib
 import errno
 import logging
 import threading
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import can
@@ -22,7 +21,7 @@ from skinnode.process import clock
 from skinnode.process.closing import Closing
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
-from skinnode.transport.frame_interface import BurstInterface, FrameInterface, SignallingInterface
+from skinnode.transport.frame_interface import FrameInterface, SignallingInterface
 from skinnode.transport.multicast import MulticastSocket, limit_to_group, new_tag
 from skinnode.transport.socket_options import enlarge_receive_buffer, socket_of
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
@@ -167,7 +166,6 @@ class CanPort(Closing):
         self._socket = self._multicast or self._reader
         self._direct: FrameInterface | None = self._multicast or _direct(self._bus)
         self._signalling = self._direct if isinstance(self._direct, SignallingInterface) else None
-        self._burst = self._direct if isinstance(self._direct, BurstInterface) else None
         self._shutdown = (self._multicast or self._bus).shutdown
 
     def _open(self) -> can.BusABC:
@@ -273,43 +271,6 @@ class CanPort(Closing):
         with self._counting:
             self._sent += 1
             self._undelivered += undelivered
-
-    @property
-    def takes_bursts(self) -> bool:
-        """Whether :meth:`send_burst` may be called: the interface accepts all frames while it is open."""
-        return self._burst is not None and not (self._closed or self._away)
-
-    def send_burst(self, can_id: int, payloads: Sequence[bytes]) -> None:
-        """Send several classic frames, or several CAN FD frames, with the same 11-bit identifier.
-
-        This is equivalent to calling :meth:`send` for each payload. Call it only if :attr:`takes_bursts`.
-
-        Args:
-            can_id: Identifier, 0 to 0x7FF.
-            payloads: Payloads, all of the same length.
-
-        Raises:
-            BusError: if the interface has failed.
-            ValueError: if the identifier or the payload length is out of range.
-        """
-        burst, length = self._burst, len(payloads[0])
-        if burst is None:
-            raise BusError(f"{self._where}: the interface does not accept bursts")
-        if not 0 <= can_id <= 0x7FF:
-            raise ValueError(f"can_id: got {can_id}, must be 0 to 0x7FF")
-        if length > self._longest:
-            raise ValueError(f"payloads: got {counted(length, 'byte')}, must be at most {self._longest}")
-        fd = length > 8
-        if fd and fd_length(length) != length:
-            payloads = [data.ljust(fd_length(length), b"\0") for data in payloads]
-        try:
-            burst.send_burst(can_id, payloads, fd=fd)
-        except (can.CanError, OSError, ValueError) as error:
-            with self._counting:
-                self._errors += 1
-            raise BusError(f"{self._where}: 0x{can_id:03X} not sent ({_why(error)})") from error
-        with self._counting:
-            self._sent += len(payloads)
 
     def _message(self, can_id: int, data: bytes, remote: bool, fd: bool) -> can.Message:
         return _Message(

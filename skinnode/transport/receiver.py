@@ -19,7 +19,6 @@ from skinnode.process import clock
 from skinnode.process.closing import Closing
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
-from skinnode.transport.socketcan import BATCH_FRAMES
 
 CAPACITY_FRAMES: Final = 16384
 """Default capacity of a queue, in frames. It holds 2 s of traffic from a fully loaded 1 Mbit/s bus (8,000
@@ -77,8 +76,6 @@ class Intake:
         """Monotonic time (ns) up to which all received frames have been queued or dropped."""
         self.due_ns = 0
         """Monotonic time (ns) of the next :meth:`fetch`."""
-        self.drained = False
-        """Whether the last batch contained all frames that had arrived, because it was not full."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
         # _taken is written by the reader thread, _put and _dropped by the receiving thread.
@@ -178,7 +175,7 @@ class Intake:
         Returns:
             Whether there are new frames or an error for :meth:`take`.
         """
-        now_ns, self.drained = clock.monotonic_ns(), False
+        now_ns = clock.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
         except Exception as error:  # passed to the reader thread
@@ -188,7 +185,6 @@ class Intake:
             self.seen_ns = now_ns
             return False
         seen_ns = frames[-1].t_ns
-        self.drained = len(frames) < BATCH_FRAMES
         room = self._capacity - self.queued
         if len(frames) > room:
             self._dropped += len(frames) - room
@@ -306,10 +302,8 @@ class Receiver(Closing):
 
     def _gather_signalled(self, intake: Intake, now_ns: int) -> None:
         """Fetch the remaining frames, and have the port announce no more until the next fetch is due."""
-        while not intake.failed and not intake.drained and intake.fetch(0.0):
+        while not intake.failed and intake.fetch(0.0):
             pass
-        if intake.drained:
-            intake.seen_ns = now_ns  # frames that arrived before now_ns have been fetched
         intake.gather(now_ns)
         port = intake.port.signalling
         if port is not None:

@@ -170,20 +170,6 @@ def test_a_counter_that_keeps_growing_is_reported_once_a_second(
     assert texts == ["1 malformed frame", "11 malformed frames", "11 malformed frames"]
 
 
-def test_growth_that_was_held_back_is_reported_although_nothing_changes_any_more(hand: HandHealth) -> None:
-    now_ns, events = [10**12], Events()
-    heard = events.subscribe(100)
-    watch = HealthWatch(hand.patches, hand.buses, events, now_ns=lambda: now_ns[0])
-    for rejoins in (1, 2):  # the second within a second of the first
-        hand.patch = replace(hand.patch, rejoins=rejoins)
-        watch.check()
-    assert reported(heard) == [("thumb", "rejoins", "1 rejoin")]
-    for _ in range(3):
-        now_ns[0] += 600_000_000
-        watch.check()  # of the same objects
-    assert reported(heard) == [("thumb", "rejoins", "1 rejoin")]
-
-
 def test_a_subscriber_that_lags_loses_the_oldest_events() -> None:
     events = Events()
     slow, quick = events.subscribe(2), events.subscribe(100)

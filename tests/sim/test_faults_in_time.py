@@ -138,7 +138,7 @@ class Stream:
         elif can_id == 0x285:
             self._keep(self.assembler.on_summary(data, self.t_ns))
 
-    def _on_sent(self, can_id: int, count: int) -> None:
+    def _on_sent(self, can_id: int) -> None:
         if can_id == 0x185:
             self.chunks += 1
             if self.hit is not None:

@@ -42,7 +42,7 @@ def node_with(faults: Faults) -> FaultyNode:
         layout,
         Steady(layout),
         emit=lambda can_id, data, *, remote=False: None,
-        on_sent=lambda can_id, count: None,
+        on_sent=lambda can_id: None,
         serial=1,
         profile=PatchProfile.from_config(patch, HAND.buses[0]),
         faults=faults,

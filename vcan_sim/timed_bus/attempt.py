@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 from vcan_sim.timed_bus.bit_rates import BitRates
 from vcan_sim.timed_bus.disturbances import Hit
 from vcan_sim.timed_bus.events import Cause
-from vcan_sim.timed_bus.frame import CanFrame, base_frame_bits, frame_bits
+from vcan_sim.timed_bus.frame import CanFrame, frame_bits
 from vcan_sim.timed_bus.wire_frame import (
     ACK_TO_END_BITS,
     FLAG_BITS,
@@ -98,10 +98,7 @@ def undisturbed_times(frame: CanFrame, esi: bool, rates: BitRates) -> tuple[int,
         esi: Whether the senders are error-passive.
         rates: Bit rates of the bus.
     """
-    if frame.fd or frame.extended:
-        free = rates.ticks(frame_bits(frame, esi))
-    else:
-        free = base_frame_bits(frame) * rates.nominal_ticks
+    free = rates.ticks(frame_bits(frame, esi))
     end = free - INTERMISSION_BITS * rates.nominal_ticks
     return end, end - (ACK_TO_END_BITS - 1) * rates.nominal_ticks, free
 

@@ -16,7 +16,6 @@ from types import MappingProxyType
 from skinnode.errors import ConfigError
 from vcan_sim.timed_bus.attempt import (
     BitError,
-    Course,
     Participant,
     cut_off,
     disturbed,
@@ -122,30 +121,6 @@ class TimedBus:
         if station not in self._pending:  # otherwise, it already takes part in the next arbitration
             self._offer(sender)
         return True
-
-    def send_all(self, time_ns: int, station: int, frames: Sequence[CanFrame]) -> None:
-        """Queue several frames with the same identifier for transmission, like :meth:`send`.
-
-        Args:
-            time_ns: Current time, ns.
-            station: Index of the sending station. Its queue must have no limit.
-            frames: Frames to send, data frames of the same format.
-
-        Raises:
-            ValueError: If the time is earlier than in a previous call, or if a CAN FD frame is sent on a bus
-                without a data bit rate.
-            IndexError: If the station does not exist.
-        """
-        sender = self._at(time_ns, station)
-        if frames[0].fd and self._rates.data_bps is None:
-            raise ValueError("frame: got a CAN FD frame, must be a classic frame because data_bps is None")
-        key, number = arbitration_key(frames[0]), self._number
-        sender.queue.extend(
-            [Waiting(key, number + i, time_ns, frame) for i, frame in enumerate(frames, start=1)]
-        )
-        self._number += len(frames)
-        if station not in self._pending:
-            self._offer(sender)
 
     def clear(self, time_ns: int, station: int) -> None:
         """Discard a station's queued frames. A transmission in progress continues.
@@ -387,14 +362,14 @@ class TimedBus:
             return False
         waiting, start = flight.waiting[sender.index], flight.start
         free, end = start + course.free, start + course.end
-        rates, bit, queue, index = self._rates, self._bit, sender.queue, sender.index
+        rates, bit, queue = self._rates, self._bit, sender.queue
         ceil_ns, events, frames = rates.ceil_ns, self._events, self._frames
-        start_ns, times, exact = ceil_ns(start), None, rates.ticks_per_ns == 1
         self._flight = self._start = self._next = None
         while end <= until:
             frame = waiting.frame
-            end_ns = end if exact else ceil_ns(end)
-            events.append(Delivered(end_ns, index, frame, receivers, waiting.queued_ns, start_ns))
+            events.append(
+                Delivered(ceil_ns(end), sender.index, frame, receivers, waiting.queued_ns, ceil_ns(start))
+            )
             identifier = (frame.can_id, frame.extended)
             frames[identifier] = frames.get(identifier, 0) + 1
             sender.sending, self._free = None, free
@@ -407,14 +382,12 @@ class TimedBus:
             sender.sending = waiting = queue.pop()
             if not len(queue):
                 pending.clear()
-            after_end, recessive, after_free = times = undisturbed_times(waiting.frame, False, rates)
+            after_end, recessive, after_free = undisturbed_times(waiting.frame, False, rates)
             free, end = start + after_free, start + after_end
             self._recessive_from = start + recessive
-            start_ns = start if exact else ceil_ns(start)
-            self._occupancy.add(start_ns, free if exact else ceil_ns(free))
-        if times is not None:  # otherwise, the frame is still the first one
-            course = Course(senders, *times)
-        self._flight = Flight(start, course, {index: waiting}, senders, receivers)
+            self._occupancy.add(ceil_ns(start), ceil_ns(free))
+        course = undisturbed(senders, waiting.frame, False, rates)
+        self._flight = Flight(start, course, {sender.index: waiting}, senders, receivers)
         self._next = end
         return True
 

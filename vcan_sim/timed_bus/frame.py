@@ -115,14 +115,5 @@ def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
         return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)
     if frame.extended:
         return exact_bits(frame.can_id, frame.data, extended=True, remote=frame.remote, dlc=frame.dlc), 0
-    return base_frame_bits(frame), 0
-
-
-def base_frame_bits(frame: CanFrame) -> int:
-    """Return the number of bits, as in :func:`frame_bits`, of a classic frame with an 11-bit identifier.
-
-    Args:
-        frame: Frame to measure.
-    """
-    can_id, data, _, remote, dlc, _, _ = frame
-    return classic_frame_bits(can_id << 7 | remote << 6 | (dlc if remote else len(data)), data)
+    length = frame.dlc if frame.remote else len(frame.data)
+    return classic_frame_bits(frame.can_id << 7 | frame.remote << 6 | length, frame.data), 0

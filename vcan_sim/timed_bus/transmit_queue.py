@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from vcan_sim.timed_bus.frame import CanFrame
@@ -27,9 +26,6 @@ class TransmitQueue(Protocol):
     def push(self, waiting: Waiting) -> None:
         """Add a frame to the queue."""
 
-    def extend(self, waiting: Sequence[Waiting]) -> None:
-        """Add frames to the queue."""
-
     def put_back(self, waiting: Waiting) -> None:
         """Put back a frame that was removed by :meth:`pop` but not sent."""
 
@@ -45,16 +41,34 @@ class TransmitQueue(Protocol):
     def __len__(self) -> int: ...
 
 
-class FifoQueue(deque[Waiting]):
-    """First-in, first-out transmit queue, as in SocketCAN. Its methods are those of a deque."""
+class FifoQueue:
+    """First-in, first-out transmit queue, as in SocketCAN."""
 
-    push = deque.append
-    put_back = deque.appendleft
-    pop = deque.popleft
+    def __init__(self) -> None:
+        self._frames: deque[Waiting] = deque()
+
+    def push(self, waiting: Waiting) -> None:
+        """Add a frame to the queue."""
+        self._frames.append(waiting)
+
+    def put_back(self, waiting: Waiting) -> None:
+        """Put back a frame that was removed by :meth:`pop` but not sent."""
+        self._frames.appendleft(waiting)
 
     def head(self) -> Waiting:
         """Return the oldest frame."""
-        return self[0]
+        return self._frames[0]
+
+    def pop(self) -> Waiting:
+        """Remove and return the oldest frame."""
+        return self._frames.popleft()
+
+    def clear(self) -> None:
+        """Remove all frames from the queue."""
+        self._frames.clear()
+
+    def __len__(self) -> int:
+        return len(self._frames)
 
 
 class PriorityQueue:
@@ -68,11 +82,6 @@ class PriorityQueue:
         heapq.heappush(self._frames, waiting)
 
     put_back = push
-
-    def extend(self, waiting: Sequence[Waiting]) -> None:
-        """Add frames to the queue."""
-        for each in waiting:
-            self.push(each)
 
     def head(self) -> Waiting:
         """Return the frame with the highest priority."""

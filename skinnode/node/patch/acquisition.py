@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
 from skinnode.node.patch.chunk_selection import ChunkSelection
-from skinnode.node.patch.quiet_band import QuietBand
 from skinnode.node.patch.source import ResistanceSource, conversions_of, read_source
 from skinnode.node.patch.wire_faults import WireFaults, find_faults
 from skinnode.protocol.codes import Codes, CodeScale, encode
@@ -48,9 +47,8 @@ class Acquisition:
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
         """(U, K) baseline R0 in ohms with REAL32 precision, as in the object dictionary; 0 where unknown."""
-        self._codes: Codes | None = np.full(shape, scale.open, dtype=np.uint32)  # None until encoded
-        self._mean_ohm = np.full(shape, np.inf)  # resistances of the last scan
-        self._band: QuietBand | None = None
+        self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
+        """(U, K) codes of the last scan; before the first scan, all are open."""
         self.faults = WireFaults.none(profile)
         """Wire faults in the last scan."""
         self.phase = 0
@@ -59,13 +57,6 @@ class Acquisition:
         self._conversions: int | None = None
         self.selection = ChunkSelection(profile, scale)
         """Selects the chunks to send in send mode 1 (changed chunks only)."""
-
-    @property
-    def codes(self) -> Codes:
-        """(U, K) codes of the last scan; before the first scan, all are open."""
-        if self._codes is None:
-            self._codes = encode(self._mean_ohm, self.baseline_ohm, self.scale)
-        return self._codes
 
     def read(self, t_ns: int) -> Float:
         """Read the source once and return (U, K) resistances in ohms.
@@ -76,7 +67,7 @@ class Acquisition:
         return read_source(self._source, (self.profile.rows, self.profile.columns), t_ns)
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
-        """Take a scan: read the source, and encode the mean of the readings unless it lies in the quiet band.
+        """Take a scan: read the source and encode the mean of the readings.
 
         Args:
             t_ns: Current time, ns.
@@ -92,23 +83,9 @@ class Acquisition:
         elif conversions != self._conversions:
             self.phase = self.phase % PHASES + 1
         self._conversions = conversions
-        self._mean_ohm = mean = resistance if readings == 1 else resistance / readings
-        self._codes = None
-        band = self._band
-        if band is not None and not (band.sent is self.selection.sent and band.contains(mean)):
-            band = self._band = None
-        self.faults = WireFaults.none(self.profile) if band else find_faults(self.codes, self.scale)
-
-    def changed_chunks(self, threshold: int, full_every: int) -> list[int] | None:
-        """Select the chunks of the last scan to send; see :meth:`ChunkSelection.changed_chunks`."""
-        selection, band = self.selection, self._band
-        if band is not None and band.threshold == threshold and selection.passes_quiet_scan(full_every):
-            return []
-        changed = selection.changed_chunks(self.codes, threshold, full_every)
-        self._band = None
-        if changed is not None and not changed:
-            self._band = QuietBand.of(selection.sent, threshold, self.baseline_ohm, self.scale)
-        return changed
+        mean = resistance if readings == 1 else resistance / readings
+        self.codes = encode(mean, self.baseline_ohm, self.scale)
+        self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
         """Return the (U, K) sum of several readings in ohms. ∞ − ∞ gives NaN, which is encoded as open."""
@@ -135,23 +112,18 @@ class Acquisition:
         with np.errstate(over="ignore", under="ignore"):  # a resistance outside the REAL32 range is invalid
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
-        self._prepare_new_baseline()
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
         self.tared = True
+        self.selection.forget()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
         """Set the R0 of one crossing in ohms. From then on, the node tares only on command."""
-        self._prepare_new_baseline()
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
+        self.selection.forget()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
         """Set the (U, K) baseline R0 in ohms."""
-        self._prepare_new_baseline()
         self.baseline_ohm = values_ohm
         self.tared = True
-
-    def _prepare_new_baseline(self) -> None:
-        """Encode the last scan with the old baseline if that is still to be done; make the next scan full."""
-        self._codes, self._band = self.codes, None
         self.selection.forget()

@@ -232,16 +232,18 @@ class PatchApplication:
         if self._baseline_changed:
             flags |= _BASELINE_CHANGED
             self._baseline_changed = False
-        changed = None
+        codes, changed = acquisition.codes, None
         if store.integer(od.SEND_POLICY, od.SEND_MODE) == SendMode.CHANGED:
-            changed = acquisition.changed_chunks(
+            changed = acquisition.selection.changed_chunks(
+                codes,
                 store.integer(od.SEND_POLICY, od.SEND_THRESHOLD),
                 store.integer(od.SEND_POLICY, od.SEND_REFRESH),
             )
-        if changed is None:
-            return pack_scan(acquisition.codes, counter, self._profile), flags, acquisition.codes
-        chunks = pack_scan(acquisition.codes, counter, self._profile, changed) if changed else []
-        return chunks, flags | _CHANGED_ONLY, acquisition.selection.sent
+        chunks = pack_scan(codes, counter, self._profile, changed)
+        if changed is not None:
+            flags |= _CHANGED_ONLY
+            codes = acquisition.selection.sent
+        return chunks, flags, codes
 
     def _tare(self, t_ns: int) -> None:
         with self.source.watch(t_ns):

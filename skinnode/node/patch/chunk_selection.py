@@ -30,17 +30,6 @@ class ChunkSelection:
         """Make the next scan a full scan because the receiver may not have the codes that were last sent."""
         self._full_scan_due = True
 
-    def passes_quiet_scan(self, full_every: int) -> bool:
-        """Count a scan without changed chunks, unless a full scan is due; return whether it was counted.
-
-        Args:
-            full_every: Interval between full scans, in scans; 0 for no regular full scans.
-        """
-        if self._full_scan_due or (full_every and self._since_full + 1 >= full_every):
-            return False
-        self._since_full += 1
-        return True
-
     def changed_chunks(self, codes: Codes, threshold: int, full_every: int) -> list[int] | None:
         """Select the chunks to send and record their codes as sent.
 

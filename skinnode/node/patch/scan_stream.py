@@ -27,7 +27,7 @@ the summary states that chunks are missing.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -191,30 +191,21 @@ class ScanStream:
 
     def _stream(self, t_ns: int) -> bool:
         """Send the chunks that are due. Return whether all chunks have been sent or discarded."""
-        carrier, tpdos = self._carrier, self._tpdos
+        unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True
-        if self._unsent and carrier.ready_ns <= t_ns:
-            due = self._due(carrier, t_ns)
-            if self._verbatim:
-                tpdos.emit_all(carrier, due)
-            else:
-                tpdos.emit_all(carrier, (tpdos.payload(carrier) for _ in due))
-        return not self._unsent
-
-    def _due(self, carrier: Tpdo, t_ns: int) -> Iterator[bytes]:
-        """Yield the chunks that are due. Each counts as sent when the next is requested."""
-        unsent, inhibit_ns = self._unsent, carrier.parameters.inhibit_ns
-        earliest_ns, synchronous = t_ns - self._catch_up_ns, carrier.parameters.synchronous
+        tpdos, inhibit_ns = self._tpdos, carrier.parameters.inhibit_ns
+        earliest_ns = t_ns - self._catch_up_ns
         while unsent and carrier.ready_ns <= t_ns:
-            if synchronous and not self._tpdos.window.lets_out(carrier.number, t_ns):
+            if carrier.parameters.synchronous and not tpdos.window.lets_out(carrier.number, t_ns):
                 unsent.clear()
-                return
-            self.chunk = chunk = unsent.popleft()
+                break
+            self.chunk = unsent.popleft()
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
-            yield chunk
+            tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
             self._chunks_sent += 1  # counted only now, because the bus may have refused the chunk
+        return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:
         flags = scan.flags if self._chunks_sent == len(scan.chunks) else scan.flags | SummaryFlag.OVERRUN

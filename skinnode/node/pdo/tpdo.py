@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import functools
 from bisect import bisect_left
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Protocol
 
 from skinnode.canopen import indices as od
@@ -145,8 +145,7 @@ class TpdoEngine:
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
         store = services.store
-        self._store, self._now = store, services.now
-        self._send, self._send_all = services.send, services.send_all
+        self._store, self._send, self._now = store, services.send, services.now
         self.window = window
         """Synchronous window (0x1007), which owners must observe for synchronous TPDOs."""
         self._claims: dict[int, Owner] = {}
@@ -309,13 +308,6 @@ class TpdoEngine:
     def emit(self, tpdo: Tpdo, payload: bytes) -> None:
         """Send a payload immediately, regardless of the inhibit time; used by owners."""
         self._send(tpdo.parameters.cob_id, payload)
-
-    def emit_all(self, tpdo: Tpdo, payloads: Iterator[bytes]) -> None:
-        """Send several payloads immediately, like :meth:`emit`.
-
-        The next payload is taken only after the bus has accepted the previous one.
-        """
-        self._send_all(tpdo.parameters.cob_id, payloads)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
         """Send a synchronous TPDO, or discard it if the synchronous window (0x1007) is closed."""

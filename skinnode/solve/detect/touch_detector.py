@@ -120,7 +120,6 @@ class TouchDetector:
             found=np.zeros(9),
         )
         self._factor = 1.0
-        self._weight_in_use: Float | None = None  # the array last copied to the kernel's arrays
         self._configure()
         self._arrays.ohm[:] = self._arrays.rest
         self._at, self._frames = 0, 1
@@ -248,9 +247,7 @@ class TouchDetector:
             weight = np.where(usable, 1.0 / np.maximum(noise, self._sigma), 0.0)
         if valid is not None:
             weight = np.where(valid, weight, 0.0)
-        if weight is not self._weight_in_use:
-            its.weight[:] = weight
-            self._weight_in_use = weight
+        its.weight[:] = weight
         self._at = (self._at + 1) % KEPT
         self._frames = min(self._frames + 1, KEPT)
         self._compute(self._noise * (1.0 + self._slow.offset_share))

@@ -94,11 +94,7 @@ class ReplayedBus:
     def _on_own_sync(self, data: bytes, t_ns: int) -> None:
         """Process a SYNC from the host; the journal has its number if the counter does not determine it."""
         self._own_syncs.on_sync(data, t_ns)
-        if (
-            self._ticks.counter_overflow
-            and self._numbered
-            and self._numbered[0]["t_ns"] <= t_ns + _ROUNDING_NS
-        ):
+        if self._numbered and self._numbered[0]["t_ns"] <= t_ns + _ROUNDING_NS:
             number = self._numbered.popleft()["number"]
             if bytes([self._ticks.counter_of(number)]) == data:  # otherwise, the time is damaged
                 self._ticks.note(number, t_ns)

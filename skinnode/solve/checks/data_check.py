@@ -213,11 +213,16 @@ class DataCheck:
             found = self._find(solved, until)
         scan = self._frame if self.scan is None else self.scan
         before = self._list.faults
-        passing = self._list.add([] if found else self._contradicting(groups, solved), self._frame, scan)
+        contradicting = [] if found else self._contradicting(groups, solved)
+        passing = self._list.add(contradicting, self._frame, scan)
         if before:
             self._follow(solved)
         faults = self._list.faults + passing
-        contradiction = CONTRADICTION if found or self._doubtful else NOISIER if self._noisy else ""
+        listed = {(fault.upper, fault.lower) for fault in faults}
+        unlisted = any((group.upper, group.lower) not in listed for group in contradicting)
+        contradiction = (
+            CONTRADICTION if found or unlisted or self._doubtful else NOISIER if self._noisy else ""
+        )
         contradiction = UNEXAMINED if self._unexamined else contradiction
         reason, wires = assess(solved.field.status, solved.used, faults, contradiction=contradiction)
         field = amended(solved.field, faults=faults, distrust=reason, wires_trusted=wires)

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.model.data_fault import DataFault
+from skinnode.model.data_fault import DataFault, FaultKind
 from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
@@ -80,6 +80,9 @@ class FaultList:
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
         """Record the groups of wrong readings in a frame and return the faults that are not yet confirmed.
 
+        Crossed wires are only reported once they are confirmed: they stay crossed, whereas a press that a
+        wire has not followed can resemble an exchange for one frame.
+
         Args:
             groups: Groups of wrong readings.
             frame: Number of the frame, as counted by the data check.
@@ -95,7 +98,7 @@ class FaultList:
             if len(self._seen[key]) >= FRAMES:
                 needed = self._needed[key] = 2 * self._needed.get(key, ADMIT // 2)
                 self._named[key] = _Named(fault, group.mask(self._shape), needed=needed)
-            else:
+            elif group.kind is not FaultKind.CROSSED:
                 passing.append(fault)
         return tuple(passing)
 

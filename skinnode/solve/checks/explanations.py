@@ -34,8 +34,7 @@ loads alone. In 1.9 million healthy frames, presses on the border of a patch rea
 MARGIN_OF_WIRE: Final = 20.0
 """Minimum margin for a wire that contradicts the others to be reported, nats. At this value, no faults were
 reported in 6,800 healthy frames of deep slides (noise 3e-6), nor in 270 frames with six kinds of presses
-(noise 1e-5). With 40, one of 432 fields with a flipped bit was trusted but wrong by 760 standard
-deviations."""
+(noise 1e-5). A smaller margin does not make a frame doubtful."""
 MARGIN_OF_READING: Final = 60.0
 """Minimum margin for a single wrong reading to be reported, nats. In the same frames, a press on the border
 reached 58 nats."""

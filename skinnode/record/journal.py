@@ -203,7 +203,9 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], l
     try:
         with path.open("rb") as file:
             kept: list[bytes] = []
-            first = file.readline(_LONGEST_HEADER)
+            first = file.read(1)  # a file of another kind is not read further
+            if first == b"{":
+                first += file.readline(_LONGEST_HEADER)
             lines = chain((first,), iter(lambda: file.readline(_LONGEST_LINE), b""))
             parsed = parse_journal(str(path), path.name, _noted(lines, kept))
             return *parsed, kept

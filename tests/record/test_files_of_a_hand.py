@@ -132,11 +132,13 @@ def test_programs_get_the_layout_file(tmp_path: Path) -> None:
     """A program compares the hands of a daemon before and after a restart."""
     hand = with_layout_file(tmp_path)
     layouts = {patch.name: patch.layout.build() for patch in hand.patches}
-    sent = Description(hand, layouts, "boot", commands=True).encode()
+    sent = Description(hand, layouts, "boot", commands=True, started_ns=1).encode()
     first = Description.decode(sent, "hand").hand
     assert first.patch("p0").layout.build().upper_m.tobytes() == LAYOUT.upper_m.tobytes()
     np.savez(tmp_path / FILE, upper_m=LAYOUT.upper_m * 1.5, lower_m=LAYOUT.lower_m)
-    second = Description.decode(Description(hand, layouts, "boot", commands=True).encode(), "hand").hand
+    second = Description.decode(
+        Description(hand, layouts, "boot", commands=True, started_ns=1).encode(), "hand"
+    ).hand
     assert second != first
 
 

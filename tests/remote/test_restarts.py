@@ -27,7 +27,7 @@ def test_fields_and_hand_frames_go_on_after_a_restart_with_an_earlier_clock(
     first = start().wait_until_up()
     with sk.connect("hand", port=port) as hand:
         fields, hands = hand.fields(), hand.hands()
-        eventually(lambda: hand.stats().patches["p0"].received > 150)  # more than the new run will have sent
+        eventually(lambda: hand.stats().patches["p0"].received > 300)  # more than the new run will have sent
         before = [frame.scan for _ in range(100) if (frame := hands.get(0.0)) is not None]
         first.kill()
         while fields.get(0.0) is not None or hands.get(0.0) is not None:

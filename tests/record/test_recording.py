@@ -53,10 +53,12 @@ class Run:
         end_s = time.monotonic() + PATIENCE_S
         while self._count(patch) < wanted:
             assert time.monotonic() < end_s
-            self.collect(0.05)
+            field = self._fields.get(0.05)
+            if field is not None:
+                self.live[key(field)] = field
 
-    def collect(self, timeout_s: float = 0.0) -> None:
-        while (field := self._fields.get(timeout_s)) is not None:
+    def collect(self) -> None:
+        while (field := self._fields.get(0.0)) is not None:
             self.live[key(field)] = field
 
     def _count(self, patch: str) -> int:

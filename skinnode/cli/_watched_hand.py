@@ -72,7 +72,8 @@ def check_options(options: WatchOptions) -> None:
     from skinnode.errors import NOTHING, ConfigError, Shown
 
     sources = {
-        "HAND.toml": options.hand is not None or options.simulate,
+        "HAND.toml": options.hand is not None,
+        "--simulate": options.simulate and options.hand is None,  # with a hand, both are one source
         "--replay": options.replay is not None,
         "--remote": options.remote is not None,
     }
@@ -84,7 +85,7 @@ def check_options(options: WatchOptions) -> None:
         raise ConfigError("--speed", options.speed, "only with --replay")
     if options.remote is None:
         options.zenoh.require_unused("only with --remote")
-    unused = given[0] if given[0] != "HAND.toml" else "--simulate" if options.simulate else None
+    unused = "--simulate" if options.simulate else given[0] if options.hand is None else None
     for option, value in (("--interface", options.interface), ("--channel", options.channel)):
         if value is not None and unused is not None:
             raise ConfigError(option, value, f"only without {unused}, which opens no bus of a hand")

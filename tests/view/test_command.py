@@ -32,7 +32,7 @@ def run(*arguments: str, code: str = PROGRAM, **variables: str) -> subprocess.Co
             [],
             "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate, --replay",
         ),
-        (["--simulate", "--replay", "x.log"], "HAND.toml: got both it and --replay"),
+        (["--simulate", "--replay", "x.log"], "--simulate: got both it and --replay"),
         (["--simulate"], "display: got none, allowed: a graphical session, or --web, or --save FILE.rrd"),
         (["/nowhere.toml", "--web"], "nowhere.toml"),
         (["--replay", "/nowhere.log", "--web"], "nowhere"),

@@ -7,6 +7,7 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from multiprocessing import resource_tracker
 from typing import Any
 
 import pytest
@@ -29,6 +30,7 @@ SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_elec
 @pytest.fixture(autouse=True)
 def nothing_left_running() -> Iterator[None]:
     """Threads and file descriptors are the same after a test as before it."""
+    resource_tracker.ensure_running()  # multiprocessing opens its pipe once, and keeps it
     threads, descriptors = set(threading.enumerate()), os.listdir("/proc/self/fd")
     yield
     left = [thread.name for thread in threading.enumerate() if thread not in threads]

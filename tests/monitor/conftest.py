@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_elec
 @pytest.fixture(autouse=True)
 def nothing_left_running() -> Iterator[None]:
     """Threads and file descriptors are the same after a test as before it."""
+    resource_tracker.ensure_running()  # multiprocessing opens its pipe once, and keeps it
     threads, descriptors = set(threading.enumerate()), os.listdir("/proc/self/fd")
     yield
     assert [thread.name for thread in threading.enumerate() if thread not in threads] == []

@@ -13,7 +13,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.config import HandConfig, parse_hand
-from skinnode.errors import SkinError
+from skinnode.errors import NodeError, SkinError
 from skinnode.remote import keys
 from skinnode.remote.command_server import CommandServer
 from skinnode.remote.commands import Request, send
@@ -130,6 +130,16 @@ def test_a_program_on_another_machine_needs_no_common_clock(session: zenoh.Sessi
     assert (programs.failures, host.tared) == ({}, ["a"])
 
 
+def tared(hand: sk.RunningHand, patch: str) -> bool:
+    """Tare a patch; return False if it is not operational."""
+    try:
+        hand.tare(patch)
+    except NodeError as error:
+        assert "not operational" in str(error)
+        return False
+    return True
+
+
 def test_a_daemon_that_was_suspended_does_not_execute_what_was_given_up(
     start: Callable[..., Process], port: int
 ) -> None:
@@ -142,6 +152,6 @@ def test_a_daemon_that_was_suspended_does_not_execute_what_was_given_up(
         finally:
             daemon.process.send_signal(signal.SIGCONT)
         eventually(lambda: hand.away is None)
-        hand.tare("p1")
+        eventually(lambda: tared(hand, "p1"))  # the host heard nothing of its patches for a while
         baselines = json.loads(daemon.tell("baselines"))
         assert (baselines["p0"], baselines["p1"] > 0) == (0, True)

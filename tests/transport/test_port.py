@@ -101,13 +101,16 @@ def test_plain_python_can_at_the_other_end(config: BusConfig, open_port, plain_b
 
 def test_time_is_that_of_arrival_not_of_reading(open_port) -> None:
     ours, theirs = open_port(), open_port()
-    time.sleep(0.1)  # the kernel starts to stamp packets a moment after the first socket asked for it
-    before_ns = time.monotonic_ns()
-    ours.send(1, b"")
-    after_ns = time.monotonic_ns()
-    time.sleep(0.2)
-    frame = receive(theirs)
-    assert before_ns - 20_000_000 <= frame.t_ns <= after_ns + 100_000_000
+    for _ in range(50):  # the kernel starts to stamp packets a moment after the first socket asked for it
+        before_ns = time.monotonic_ns()
+        ours.send(1, b"")
+        after_ns = time.monotonic_ns()
+        time.sleep(0.2)
+        frame = receive(theirs)
+        assert before_ns - 20_000_000 <= frame.t_ns
+        if frame.t_ns <= after_ns + 100_000_000:
+            return
+    pytest.fail("50 frames in a row have the time at which they were read")
 
 
 def test_clock_of_another_machine_is_not_believed(config: BusConfig, open_port, monkeypatch) -> None:

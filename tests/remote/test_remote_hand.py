@@ -37,7 +37,9 @@ def test_a_program_has_what_the_host_has(start: Callable[..., Process], port: in
         seen = [next(iter(fields)) for _ in range(20)]
         for name in ("p0", "p1"):
             scans = [field.stamp.scan for field in seen if field.stamp and field.stamp.patch == name]
-            assert scans == sorted(scans)  # a host that is held up skips scans, and assembles one in two parts
+            assert scans == sorted(
+                scans
+            )  # a host that is held up skips scans, and assembles one in two parts
             eventually(lambda name=name: hand.health(name).condition is Condition.OPERATIONAL)
         newest = hand.latest("p0")
         assert newest is not None

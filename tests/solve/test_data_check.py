@@ -14,8 +14,8 @@ import skinnode as sk
 from skinnode.bench.truth import RUBBER
 from skinnode.model.elastic import HertzContact
 from skinnode.model.layout import Float
-from skinnode.solve.checks import data_check
-from skinnode.solve.checks.data_check import PATIENCE
+from skinnode.solve.checks import examination_time
+from skinnode.solve.checks.examination_time import PATIENCE
 from skinnode.solve.checks.fault_list import ADMIT, FRAMES
 from skinnode.solve.checks.field_trust import UNEXAMINED
 from tests.solve.press import dent, noisy
@@ -80,7 +80,7 @@ def test_wrong_readings_under_a_press_are_named_and_the_rest_goes_on(kind: str, 
 
 def test_a_fault_is_named_although_the_deadline_never_leaves_time_to_examine_it(monkeypatch) -> None:
     """Until then, no field with the wrong reading is trusted; afterwards all are."""
-    monkeypatch.setattr(data_check, "perf_counter", lambda: time.perf_counter() + 10.0)
+    monkeypatch.setattr(examination_time, "perf_counter", lambda: time.perf_counter() + 10.0)
     rng = np.random.default_rng(3)
     tracker = sk.Tracker(LAYOUT, method="exact", relative_noise=NOISE, deadline_us=5_000_000)
     rest = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
@@ -104,7 +104,7 @@ def test_a_patch_that_keeps_still_is_examined_when_there_is_time(monkeypatch) ->
     frame = readings(press(0.1), np.random.default_rng(3))
     spoil("crossing", frame, sk.resistance_ohm(LAYOUT, LAYOUT.upper_m))
     with monkeypatch.context() as late:
-        late.setattr(data_check, "perf_counter", lambda: time.perf_counter() + 10.0)
+        late.setattr(examination_time, "perf_counter", lambda: time.perf_counter() + 10.0)
         assert tracker.update(frame).distrust == UNEXAMINED
     field = tracker.update(frame)
     assert [fault.upper for fault in field.faults] == [4]
@@ -172,3 +172,40 @@ def test_noise_larger_than_stated_is_not_taken_for_wrong_readings(method: str) -
         else:
             assert field.trusted
     assert field.noise_factor == pytest.approx(10.0, rel=0.2)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15])
+def test_a_grossly_wrong_reading_never_moves_a_trusted_wire(share: float) -> None:
+    """It can move its whole wire so far that the readings, linearised at rest, seem to be caused by loads."""
+    rng = np.random.default_rng(8)
+    tracker = sk.Tracker(LAYOUT, method="exact", relative_noise=NOISE)
+    moved = press(share) if share else np.zeros_like(LAYOUT.upper_m)
+    for _ in range(24):
+        frame = readings(moved, rng)
+        frame[rng.integers(10), rng.integers(30)] *= rng.choice([0.4, 0.6, 0.8, 0.93, 1.1, 1.3, 1.7])
+        field = tracker.update(frame)
+        assert not field.trusted or off(field, moved) < 5.0
+        assert field.faults or not field.trusted
+        tracker.reset()
+        tracker.update(readings(moved, rng))
+
+
+def test_a_reading_that_jumps_during_a_press_is_left_out() -> None:
+    """The error is small for a press, but no load changes so small a part of the patch in one frame."""
+    rng = np.random.default_rng(9)
+    tracker = sk.Tracker(LAYOUT, method="exact", relative_noise=NOISE)
+    wrong = 0
+    for number, share in enumerate(np.linspace(0.1, 0.35, 60)):
+        frame = readings(press(share), rng)
+        is_bad = number % 3 == 2
+        if is_bad:
+            frame[rng.integers(10), rng.integers(30)] *= (
+                1.0 + rng.choice([-1, 1]) * rng.uniform(80, 150) * NOISE
+            )
+        field = tracker.update(frame)
+        if is_bad:
+            wrong += field.trusted and off(field, press(share)) > 5.0
+        else:
+            assert field.trusted, field.distrust
+            assert off(field, press(share)) < 5.0
+    assert wrong <= 1

@@ -124,6 +124,7 @@ class ExactTracker:
             self._code_noise[:] = codes.relative_noise
         self._code_factor = 1.0  # noise factor already included in the code map
         self._noise_estimate: NoiseEstimate | None = None
+        self._all_valid: NDArray[np.bool_] | None = None  # valid readings of a frame that is solved again
         self.invalid_codes = 0
         """Number of invalid codes in the last scan."""
         self.reset()
@@ -161,7 +162,7 @@ class ExactTracker:
         resistance is out of range, otherwise ILL_CONDITIONED. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
-        arrays = self.arrays
+        arrays, self._all_valid = self.arrays, None
         # The kernel stores the addresses of these arrays, so they must be modified in place.
         arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         arrays.noise[:] = (
@@ -184,7 +185,7 @@ class ExactTracker:
         Raises ValueError if ``codes`` has the wrong shape or is not uint32.
         """
         start = perf_counter()
-        arrays, estimate = self.arrays, self._noise_estimate
+        arrays, estimate, self._all_valid = self.arrays, self._noise_estimate, None
         arrays.codes[:] = checked_codes(codes, self.layout)
         if estimate is None:
             return self._advance(stage.DECODE | stage.SCALE, start)
@@ -198,8 +199,12 @@ class ExactTracker:
     def update_again(self, left_out: NDArray[np.bool_]) -> FieldFrame:
         """Return the field of the last frame, solved again without the readings ``left_out`` (U, K)."""
         start = perf_counter()
-        self.distrust(np.asarray(left_out.any(axis=1)))
-        self.arrays.valid[left_out] = False
+        valid = self.arrays.valid
+        if self._all_valid is None:
+            self._all_valid = valid.copy()
+        remaining = self._all_valid & ~left_out
+        self.distrust(np.asarray((remaining != valid).any(axis=1)))
+        valid[:] = remaining
         return self._advance(stage.SCALE, start)
 
     def _advance(self, stages: int, start: float) -> FieldFrame:

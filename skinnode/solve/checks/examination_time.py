@@ -1,0 +1,68 @@
+"""Decides whether the deadline of a frame leaves time to examine the frame."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skinnode.process.clock import perf_counter
+
+PATIENCE: Final = 4
+"""Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
+makes every subsequent frame suspicious; a press rarely does."""
+FIRST_S: Final = 3e-3
+"""Assumed duration of the first examination, s. Later examinations are timed."""
+
+
+class ExaminationTime:
+    """Time that examinations take, and the suspicious frames that there was no time to examine.
+
+    Attributes:
+        expected_s: Expected duration of an examination, s.
+        is_overdue: Whether the frame is examined regardless of its deadline.
+    """
+
+    def __init__(self) -> None:
+        self.expected_s = FIRST_S
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames that were not examined."""
+        self._waiting, self.is_overdue = 0, False
+
+    def start_frame(self) -> None:
+        """Prepare for a new frame."""
+        self.is_overdue = False
+
+    def nothing_waits(self) -> None:
+        """Record a frame that need not be examined."""
+        self._waiting = 0
+
+    def insist(self) -> None:
+        """Let the next suspicious frame be examined, whether or not there is time."""
+        self._waiting = PATIENCE
+
+    def allows(self, until: float, seconds: float | None = None) -> bool:
+        """Return whether a step of a suspicious frame may be started.
+
+        The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would miss it.
+
+        Args:
+            until: Deadline, as a value of :func:`skinnode.process.clock.perf_counter`, s.
+            seconds: Duration of the step; default: :attr:`expected_s`.
+        """
+        if self.is_in_time(until, seconds):
+            return True
+        self._waiting += 1
+        self.is_overdue = self._waiting >= PATIENCE
+        if self.is_overdue:
+            self._waiting = 0
+        return self.is_overdue
+
+    def is_in_time(self, until: float, seconds: float | None = None) -> bool:
+        """Return whether a step that takes ``seconds`` ends by ``until``, or the frame is overdue."""
+        seconds = self.expected_s if seconds is None else seconds
+        return self.is_overdue or perf_counter() + seconds <= until
+
+    def took(self, seconds: float) -> None:
+        """Record the duration of an examination, s."""
+        self.expected_s = max(seconds, 0.8 * self.expected_s)

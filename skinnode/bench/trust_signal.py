@@ -167,7 +167,7 @@ def make(
         ordinary |= fault.ordinary
         scored_from = max(scored_from, fault.scored_from)
     truth, force = motion(layout, load, timeline, rng)
-    ohm = np.stack([skin.resistance_ohm(moved) for moved in truth])
+    ohm = _resistances(skin, truth)
     start = timeline.rest + timeline.press
     signal = Signal(
         rng,
@@ -203,6 +203,14 @@ def make(
         signal.phase,
         scored_from,
     )
+
+
+def _resistances(skin: Skin, truth: Float) -> Float:
+    """Return the (T, U, K) resistances in ohms; those of an untouched patch are computed only once."""
+    ohm = np.repeat(skin.rest_ohm[None], len(truth), axis=0)
+    for t in np.flatnonzero(truth.any(axis=(1, 2, 3))):
+        ohm[t] = skin.resistance_ohm(truth[t])
+    return ohm
 
 
 def motion(

@@ -96,8 +96,10 @@ def test_duplicated_and_late_chunks(running: Suffers) -> None:
         lambda injected: injected.duplicated > 10 and injected.late > 10,
     )
     counted, injected = running.counted(), running.injected()
-    assert counted.duplicates == injected.duplicated
-    assert counted.late == counted.chunks_lost == injected.late
+    assert counted.chunks_lost == injected.late
+    # The duplicate of a scan's last frame is late when the scan has been given up by then.
+    assert counted.late >= injected.late
+    assert counted.late + counted.duplicates == injected.late + injected.duplicated
     assert counted.scans_torn == injected.scans_spoilt
 
 

@@ -221,9 +221,14 @@ def test_summaries_that_are_lost_are_said_and_status_1(
 ) -> None:
     path = write_hand(tmp_path, "virtual", "lossy")
     path.write_text(path.read_text().replace("period_ms = 200", "period_ms = 50"))
-    with Fleet(load_hand(path), faults=Faults(summary_lost=0.5)):
-        assert run(str(path), "--seconds", "2") == 1
-    faults = [line for line in capsys.readouterr().out.splitlines() if line.startswith("fault: ")]
+    for _ in range(10):
+        with Fleet(load_hand(path), faults=Faults(summary_lost=0.5)):
+            status = run(str(path), "--seconds", "2")
+        said = capsys.readouterr().out
+        if "could not keep up" not in said:  # which would explain the losses
+            break
+    assert status == 1
+    faults = [line for line in said.splitlines() if line.startswith("fault: ")]
     for patch in ("thumb", "index"):
         assert any(re.fullmatch(f"fault: {patch}: [0-9]+ summaries lost", line) for line in faults)
 

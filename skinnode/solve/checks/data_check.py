@@ -58,6 +58,9 @@ RELINEARISED: Final = 50.0
 explain is linearised again, about the field without that reading. A field computed from a grossly wrong
 reading can be so far off that the linearised readings of its whole wire appear to be caused by loads. The
 gain was at most 37 nats in 3,000 healthy frames (``bench trust --seed 1``)."""
+UNRESOLVED_FRAMES: Final = 10
+"""Number of frames after an unexplained contradiction during which a gain above :data:`RELINEARISED` makes a
+frame doubtful, even if loads seem to explain it."""
 COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings left out at once if several upper wires have no solution. If the
 search finds more groups, only the first is left out."""
@@ -135,7 +138,7 @@ class DataCheck:
         self._last_field.forget()
         self._suspect: int | None = None  # reading of the frame that is very likely to be wrong
         self._crossed: tuple[Group, ...] = ()
-        self._crossed_until = 0
+        self._crossed_until = self._unresolved_until = 0
         self._last: FieldFrame | None = None
         self._unexamined = False
         self._time.reset()
@@ -204,6 +207,8 @@ class DataCheck:
         reason, wires = assess(solved.field.status, solved.used, faults, contradiction=contradiction)
         field = amended(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
         self._last = field
+        if contradiction == CONTRADICTION:
+            self._unresolved_until = self._frame + UNRESOLVED_FRAMES
         if not reason and not groups and self._is_complete(solved):
             self._last_field.remember(field, self._frame)
         return field
@@ -225,6 +230,7 @@ class DataCheck:
         found = self._find(solved, until) if until > -math.inf else ()
         if not found and self._suspect is not None:
             solved, found = self._find_without(self._suspect, solved, solve_without, until)
+            self._doubtful |= not found and self._frame < self._unresolved_until
         while found and len(groups) < ROUNDS:
             if not self._time.allows(until, 0.0):
                 self._unexamined = True

@@ -30,6 +30,7 @@ hand = parse_hand({
 })
 for scene in sys.argv[1:]:
     seed, twin = int(scene.removesuffix("+twin")), scene.endswith("+twin")
+    end_ns = 1_002_500_000_000 if twin else 1_004_000_000_000
     with VirtualClock() as clock:
         trace = Trace(segment("can0", clock, BitRates(1_000_000)))
         faults = Faults(seed=seed, lost=0.01, restart_every_s=3.0, sdo_response_lost=0.02)
@@ -38,7 +39,7 @@ for scene in sys.argv[1:]:
             stream = host.fields(timeout_s=5)
             if twin:
                 fleet.inject(replace(faults, duplicate_node_id=True), "p0")
-            while clock.monotonic_ns() < 1_004_000_000_000:
+            while clock.monotonic_ns() < end_ns:
                 field = next(iter(stream))
                 fields.update(repr((field.stamp, field.status)).encode() + field.displacement_m.tobytes())
                 seen += 1
@@ -62,7 +63,7 @@ def run(hash_seed: int, *scenes: str, before: str = "") -> tuple[list[str], str]
         env=os.environ | {"PYTHONHASHSEED": str(hash_seed)},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=100,
         check=False,
     )
     assert done.returncode == 0, done.stderr

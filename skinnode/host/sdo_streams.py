@@ -6,8 +6,8 @@ stream              canopen 2.4.1                                              h
 block upload        calls a missing method, ``abort``, if the end of the       has the method
                     transfer does not arrive
 block upload        requests a late segment twice                              requests it once
-block upload        reads the system clock to limit a retransmission, even in  reads :mod:`skinnode.process.clock`
-                    virtual time
+block upload        limits a retransmission on the system clock, even in       limits it on the clock of
+                    virtual time                                               :mod:`skinnode.process`
 block download      raises RuntimeError if a segment of the last block must    sends it again
                     be sent again; its CRC then counts segments twice
 both downloads      closing a failed transfer continues it, and waits for      closing sends nothing

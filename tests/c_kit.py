@@ -1,16 +1,20 @@
 """The C99 kit as a program: compiled for a patch under sanitizers, fed with commands, read back.
 
-``tests/c_driver.c`` says what its commands are.
+``tests/c_driver.c`` says what its commands are. Programs are kept in pytest's cache folder, under a name that
+contains a digest of all that a compiler reads: to compile them takes more CPU time than to run them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
 import os
 import shutil
 import struct
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +35,11 @@ STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 SANITIZED: Final = (*STRICT, "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 LEVELS: Final = {"gcc": "-O1", "clang": "-O0"}
 """One program is optimised, and the other is as written; clang needs three times as long for -O1."""
+
+PROGRAMS: Final = Path(__file__).parents[1] / ".pytest_cache" / "d" / "skinnode-c"
+"""Folder of the programs; ``pytest --cache-clear`` removes it."""
+KEPT_S: Final = 7 * 24 * 3600.0
+"""Time after which a program that no test has used is removed."""
 
 NO_SCAN, COMPLETE, TORN, UNCHECKED, MIXED, CORRUPT, JOINED = range(7)
 PUBLISHED: Final = (COMPLETE, TORN, UNCHECKED)
@@ -55,11 +64,6 @@ def available() -> list[str]:
     return found
 
 
-@functools.cache
-def _scratch() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="skinnode-c-")
-
-
 def write_kit(profile: PatchProfile, folder: Path, layout: PatchLayout | None = None) -> Path:
     """Write the kit's files, and return the source file."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -75,10 +79,28 @@ def compile_c(arguments: Sequence[str | Path]) -> None:
 
 
 @functools.cache
+def _version(compiler: str) -> str:
+    asked = [require(compiler), "--version"]
+    return subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+
+
+@functools.cache
 def _program(profile: PatchProfile, compiler: str) -> Path:
-    folder = Path(_scratch().name) / f"{compiler}-{abs(hash(profile))}"
-    source, program = write_kit(profile, folder), folder / "driver"
-    compile_c([require(compiler), *SANITIZED, LEVELS[compiler], "-I", folder, source, DRIVER, "-o", program])
+    options = (*SANITIZED, LEVELS[compiler])
+    read = (_version(compiler), options, sorted(kit_files(profile, None).items()), DRIVER.read_text())
+    program = PROGRAMS / f"{compiler}-{hashlib.sha256(repr(read).encode()).hexdigest()[:24]}"
+    if program.exists():
+        program.touch()
+        return program
+    PROGRAMS.mkdir(parents=True, exist_ok=True)
+    for old in PROGRAMS.glob("*-*"):
+        with contextlib.suppress(FileNotFoundError):  # removed by another worker
+            if old.stat().st_mtime < time.time() - KEPT_S:
+                old.unlink()
+    with tempfile.TemporaryDirectory(prefix="new.", dir=PROGRAMS) as folder:
+        source, made = write_kit(profile, Path(folder)), Path(folder) / "driver"
+        compile_c([require(compiler), *options, "-I", folder, source, DRIVER, "-o", made])
+        made.replace(program)
     return program
 
 

@@ -6,6 +6,8 @@ stream              canopen 2.4.1                                              h
 block upload        calls a missing method, ``abort``, if the end of the       has the method
                     transfer does not arrive
 block upload        requests a late segment twice                              requests it once
+block upload        limits a retransmission on the system clock, even in       limits it on the clock of
+                    virtual time                                               :mod:`skinnode.process`
 block download      raises RuntimeError if a segment of the last block must    sends it again
                     be sent again; its CRC then counts segments twice
 both downloads      closing a failed transfer continues it, and waits for      closing sends nothing
@@ -44,6 +46,9 @@ _RETRANSMISSIONS: Final = 20
 """Maximum number of retransmissions in one transfer. If a node requests more than this, it probably rejects
 every block, so the transfer fails.
 """
+
+_SEQUENCE: Final = 0x7F
+"""Bits of a segment's first byte that contain its sequence number."""
 
 
 class Client(SdoClient):
@@ -124,6 +129,22 @@ class BlockUpload(BlockUploadStream):
                 response = bytes(8)  # sequence number 0 is invalid
             self.sdo_client.responses.queue.appendleft(response)
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # canopen is not typed
+
+    def _retransmit(self) -> bytes:
+        """Request the segments after the last valid one again, and return the first of them.
+
+        Raises:
+            SdoError: if the segment does not arrive in time, or the response is an abort.
+        """
+        end_s = clock.monotonic() + self.sdo_client.RESPONSE_TIMEOUT
+        self._ack_block()  # type: ignore[no-untyped-call]  # canopen is not typed
+        while clock.monotonic() < end_s:
+            response: bytes = self.sdo_client.read_response()
+            if response[0] & _SEQUENCE == self._ackseq + 1:
+                self._ackseq += 1
+                return response
+        self.abort(AbortCode.TIMED_OUT)
+        raise SdoCommunicationError("Some data was lost and could not be retransmitted")
 
     def abort(self, abort_code: int) -> None:
         """Store the abort code. canopen calls this method if the end of the transfer does not arrive."""

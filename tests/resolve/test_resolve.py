@@ -23,6 +23,7 @@ from skinnode.config import HandConfig, load_hand
 from skinnode.errors import SkinError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
+from skinnode.process.closing import Closing
 from skinnode.record import replay
 from skinnode.record.convert import convert
 from skinnode.record.open_recording import open_recording
@@ -33,6 +34,28 @@ from skinnode.resolve.plan import make_plan
 from skinnode.resolve.recording import recording_at
 from skinnode.resolve.run import WORK_FOLDER, run, work_folder
 from skinnode.resolve.settings import variants
+
+
+class InTurn(Closing):
+    """Runs the units in this process, one after the other."""
+
+    def __init__(self, count: int, folder: Path) -> None:
+        self.count, self._folder, self._waiting = count, folder, list[units.Unit]()
+
+    def submit(self, unit: units.Unit) -> None:
+        self._waiting.append(unit)
+
+    def finished(self, timeout_s: float) -> list[str]:
+        return [units.run_unit(self._waiting.pop(0), str(self._folder), identity(), "this process")]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command solves in this process: a process takes more than a second of CPU time to load."""
+    monkeypatch.setattr(processes, "Processes", InTurn)
 
 
 def resolve(*arguments: object, status: int = 0) -> Any:
@@ -102,7 +125,7 @@ def solved_live(recording: Path, **solver: object) -> dict[tuple[str, int], byte
     return fields
 
 
-def test_a_sweep_has_a_file_and_a_line_for_each_value(recording: Path, tmp_path: Path) -> None:
+def test_a_sweep_has_a_file_and_a_line_for_each_value(recording: Path, tmp_path: Path, in_turn: None) -> None:
     results = resolve(recording, "-o", tmp_path, "--set", "solver.method=exact,posterior", "--processes", 1)
     assert [each["settings"] for each in results] == [{"solver.method": m} for m in ("exact", "posterior")]
     for result in results:
@@ -133,7 +156,7 @@ def test_a_calibration_of_one_patch_changes_its_forces_only(recording: Path, tmp
     assert forces > 10
 
 
-def test_a_replay_of_a_result_gives_its_fields(recording: Path, tmp_path: Path) -> None:
+def test_a_replay_of_a_result_gives_its_fields(recording: Path, tmp_path: Path, in_turn: None) -> None:
     """The journal of the MCAP file contains the options with which it was solved."""
     setting = "solver.method=posterior"
     (result,) = resolve(recording, "-o", tmp_path, "--format", "mcap", "--set", setting, "--processes", 1)
@@ -254,22 +277,6 @@ def test_parts_of_another_baseline_are_not_used(recording: Path, tmp_path: Path)
         units.run_unit(changed.solves[0], str(tmp_path), identity(), "a worker")
 
 
-class InTurn:
-    """Runs the units in this process, one after the other."""
-
-    def __init__(self, folder: Path) -> None:
-        self.count, self._folder, self._waiting = 1, folder, list[units.Unit]()
-
-    def submit(self, unit: units.Unit) -> None:
-        self._waiting.append(unit)
-
-    def finished(self, timeout_s: float) -> list[str]:
-        return [units.run_unit(self._waiting.pop(0), str(self._folder), identity(), "this process")]
-
-    def close(self) -> None:
-        pass
-
-
 class Killed(BaseException):
     """Stands in for SIGKILL."""
 
@@ -307,7 +314,7 @@ def test_a_command_killed_at_any_rename_of_its_result_continues(
         monkeypatch.setattr(os, "fsync", watched)
         for _ in range(10):
             with suppress(Killed):
-                (summary,) = run([job], InTurn(folder), PartFiles(folder), lambda *_: None)
+                (summary,) = run([job], InTurn(1, folder), PartFiles(folder), lambda *_: None)
                 break
         monkeypatch.undo()
     assert kills == 4
@@ -350,7 +357,7 @@ def test_a_killed_command_continues_where_it_was(recording: Path, tmp_path: Path
     assert result["fields"] == len(list(replay(recording)))
 
 
-def test_unknown_deviations_do_not_lower_the_mean(recording: Path, tmp_path: Path) -> None:
+def test_unknown_deviations_do_not_lower_the_mean(recording: Path, tmp_path: Path, in_turn: None) -> None:
     """In the second half of the recording, all chunks are missing."""
     lossy = tmp_path / "lossy.log"
     lines = recording.read_text().splitlines(keepends=True)
@@ -453,7 +460,9 @@ def test_a_recording_that_changes_meanwhile_is_refused(recording: Path, tmp_path
         known.opened(hand)
 
 
-def test_a_log_of_another_master_is_solved_with_the_hand_file(recording: Path, tmp_path: Path) -> None:
+def test_a_log_of_another_master_is_solved_with_the_hand_file(
+    recording: Path, tmp_path: Path, in_turn: None
+) -> None:
     log, plan = foreign(recording, tmp_path)
     arguments = ["--hand", plan, "--processes", 2, "-o", tmp_path / "out"]
     (result,) = resolve(log, *arguments, status=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import re
 from dataclasses import dataclass
 
 from vcan_sim.timed_bus import CanFrame
@@ -13,6 +15,8 @@ CRC_17 = sum(1 << power for power in (16, 14, 13, 11, 6, 4, 3, 1, 0))
 CRC_21 = sum(1 << power for power in (20, 13, 11, 7, 4, 3, 0))
 GRAY = {0: "0000", 1: "0011", 2: "0110", 3: "0101", 4: "1100", 5: "1111", 6: "1010", 7: "1001"}
 """Stuff count modulo 8 to its Gray code and parity bit: ISO 11898-1:2015, table of the stuff count."""
+FIVE_EQUAL = re.compile("0{5}|1{5}")
+OTHER = {"0": "1", "1": "0"}
 
 
 @dataclass
@@ -49,48 +53,55 @@ def head(frame: CanFrame, esi: bool = False) -> tuple[str, int | None]:
     return f"{bits}{frame.dlc if frame.remote else len(frame.data):04b}", None
 
 
-def shift_out(bits: str, width: int, polynomial: int, register: int) -> str:
+def shift(bits: str, width: int, polynomial: int, register: int) -> int:
     """The CRC register after the bits, each shifted in by itself."""
     for bit in bits:
         top = register >> (width - 1)
         register = (register << 1) % (1 << width)
         if top != int(bit):
             register ^= polynomial
-    return f"{register:0{width}b}"
+    return register
+
+
+@functools.cache
+def shift_eight(width: int, polynomial: int) -> list[int]:
+    """The register after eight bits, if it was 0 before; eight bits at a time take a fifth of the time."""
+    return [shift(f"{byte:08b}", width, polynomial, 0) for byte in range(256)]
+
+
+def shift_out(bits: str, width: int, polynomial: int, register: int) -> str:
+    """The CRC register after the bits."""
+    after, whole = shift_eight(width, polynomial), len(bits) // 8 * 8
+    for byte in int(bits[:whole], 2).to_bytes(whole // 8, "big"):
+        register = (register << 8) % (1 << width) ^ after[register >> (width - 8) ^ byte]
+    return f"{shift(bits[whole:], width, polynomial, register):0{width}b}"
 
 
 def draw(frame: CanFrame, esi: bool = False) -> Drawn:
     """The frame on the bus."""
-    before, esi_at = head(frame, esi)
-    plain = before + "".join(f"{byte:08b}" for byte in frame.data)
+    bits, fast_from = head(frame, esi)
+    bits += "".join(f"{byte:08b}" for byte in frame.data)
     if not frame.fd:
-        plain += shift_out(plain, 15, CRC_15, 0)
-    bits: list[str] = []
-    fast: list[bool] = []
-    run, stuff_bits, is_fast = 0, 0, False
-    for place, bit in enumerate(plain):
-        is_fast = is_fast or place == esi_at
-        run = run + 1 if bits and bits[-1] == bit else 1
-        bits.append(bit)
-        fast.append(is_fast)
-        if run == 5 and not (frame.fd and place + 1 == len(plain)):
-            bits.append("0" if bit == "1" else "1")
-            fast.append(is_fast)
-            run, stuff_bits = 1, stuff_bits + 1
+        bits += shift_out(bits, 15, CRC_15, 0)
+    plain, at = len(bits), 0
+    while (five := FIVE_EQUAL.search(bits, at)) and not (frame.fd and five.end() == len(bits)):
+        at = five.end()  # place of the stuff bit, which is the first of the next run
+        bits = bits[:at] + OTHER[bits[at - 1]] + bits[at:]
+        if fast_from is not None and at <= fast_from:
+            fast_from += 1
     stuffed, fixed = len(bits), []
     if frame.fd:
-        count = GRAY[stuff_bits % 8]
-        covered = "".join(bits) + count
+        count = GRAY[(stuffed - plain) % 8]
         wide = len(frame.data) > 16
-        crc = shift_out(covered, 21, CRC_21, 1 << 20) if wide else shift_out(covered, 17, CRC_17, 1 << 16)
-        for place, bit in enumerate(count + crc):
-            if place % 4 == 0:
-                fixed.append(len(bits))
-                bits.append("0" if bits[-1] == "1" else "1")
-            bits.append(bit)
-    fast += [is_fast] * (len(bits) + 1 - len(fast))
+        crc = (21, CRC_21, 1 << 20) if wide else (17, CRC_17, 1 << 16)
+        field = count + shift_out(bits + count, *crc)
+        for place in range(0, len(field), 4):
+            fixed.append(len(bits))
+            bits += OTHER[bits[-1]] + field[place : place + 4]
+    slow = len(bits) + 1 if fast_from is None else fast_from
+    at_data_rate = [False] * slow + [True] * (len(bits) + 1 - slow) + [False] * 9
     tail = "1" + "0" + "1" + "1" * 7  # CRC delimiter, ACK slot, ACK delimiter, end of frame
-    return Drawn("".join(bits) + tail, fast + [False] * 9, stuffed, len(plain), fixed)
+    return Drawn(bits + tail, at_data_rate, stuffed, plain, fixed)
 
 
 def error_seen_at(drawn: Drawn, bit: int, value: str, flag: str) -> int:

@@ -123,6 +123,8 @@ class Replay:
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = recording.frames
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
+        self.has_baselines = any(event["event"] == "resumed" for event in events)
+        """Whether the journal contains a baseline; if not, no scan can be decoded."""
         repairs = [event for event in events if event["event"] == "repaired"]
         ends = [event for event in events if event["event"] == "ended"] or repairs
         self.ended = bool(ends)

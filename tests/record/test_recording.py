@@ -247,6 +247,8 @@ def test_listening_writes_what_is_heard_and_sends_nothing(any_bus: BusConfig, tm
     assert heard == []
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert told[-1] == {"frames": len(numbers), "dropped": 0}
+    replayed = CliRunner().invoke(app, ["replay", str(path), "--fast"])
+    assert "note: the recording contains no baselines, as after skinnode record --listen; " in replayed.stdout
 
 
 HAND = """

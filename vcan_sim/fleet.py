@@ -230,13 +230,16 @@ class Fleet:
         return self._segments[bus].injected()
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the nonzero counts of injected faults for each patch and each bus."""
+        """Return the nonzero counts of injected faults for each patch and each bus.
+
+        The number of PDOs is not included, because PDOs are no faults.
+        """
         found: dict[str, Injected | InjectedOnBus] = {
             name: self.injected_bus(name) for name in self._segments
         }
         found = {**found, **{name: self.injected(name) for name in self._stations}}
         return {
-            place: {name: count for name, count in asdict(found[place]).items() if count}
+            place: {name: count for name, count in asdict(found[place]).items() if count and name != "pdos"}
             for place in (*self._stations, *self._segments)
         }
 

@@ -74,6 +74,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip a test if its ``skin_bus`` marker does not list the selected bus."""
     chosen = item.config.getoption("--skin-bus")
     for marker in item.iter_markers("skin_bus"):
+        if not marker.args:
+            raise pytest.UsageError(f"skin_bus: got no bus, must be one or more of {', '.join(BUSES)}")
         for bus in marker.args:
             if bus not in BUSES:
                 raise pytest.UsageError(f"skin_bus: got {bus!r}, must be one of {', '.join(BUSES)}")
@@ -308,10 +310,12 @@ def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
 
 
 @pytest.fixture
-def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame], PatchTruth]:
+def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame | None], PatchTruth]:
     """Function that returns the ground truth of a field. The hand must play a scene."""
 
-    def truth(field: FieldFrame) -> PatchTruth:
+    def truth(field: FieldFrame | None) -> PatchTruth:
+        if field is None:  # as returned by Host.latest before the first field
+            raise ValueError("field: got None, must be a field from a host; wait for the first field")
         if field.stamp is None:
             raise ValueError("field: got a field without a stamp, must be a field from a host")
         fleet = _skin_test.started("skin_truth")

@@ -78,7 +78,7 @@ def asked_publication(connections: ZenohOptions, *, publish: bool, commands: boo
     if not publish:
         connections.require_unused("only with --publish")
         if commands:
-            raise ConfigError("--commands", Shown("it"), "only with --publish")
+            raise ConfigError("--commands", Shown("no --publish"), "only with --publish")
         return AskedPublication(None, commands=False)
     options = connections.session("--publish")
     from skinnode.remote.session import require_protected

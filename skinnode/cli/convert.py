@@ -56,10 +56,15 @@ def convert(
     The exit status is 1 if the source is damaged or incomplete, and 2 if it could not be converted.
     """
     from skinnode.config import load_hand
+    from skinnode.errors import ConfigError
+    from skinnode.record.convert import TARGETS, ending_in
     from skinnode.record.convert import convert as run
+    from skinnode.record.open_recording import FRAME_FILES
 
     plan = None if hand is None else load_hand(hand)
-    if target.suffix == _RRD:
+    if source.suffix in FRAME_FILES and target.suffix not in (*TARGETS, _RRD):
+        raise ConfigError("target", str(target), ending_in((*TARGETS, _RRD)))
+    if source.suffix in FRAME_FILES and target.suffix == _RRD:
         done = _draw(source, target, plan)
     else:
         done = run(source, target, hand=plan, frames_only=frames_only)
@@ -87,7 +92,7 @@ def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
     from skinnode.view.file_conversion import convert_to_file
     from skinnode.view.viewer_process import require_viewer
 
-    require_viewer()
+    require_viewer("target")
     if target.exists():
         raise ConfigError("target", str(target), "a new file; this one exists and is not overwritten")
     if not target.parent.is_dir():

@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from skinnode.record import Replay
 
 
+_NO_BASELINES = (
+    "the recording contains no baselines, as after skinnode record --listen; to compute fields, replay a "
+    "copy of the log without its journal with --hand"
+)
+
+
 def replay(
     recording: Annotated[
         Path,
@@ -68,15 +74,16 @@ def replay(
             depth_m = float(-field.displacement_m[..., 2].min())
             deepest_m[field.stamp.patch] = max(deepest_m[field.stamp.patch], depth_m)
     faults = _faults(run)
+    told = run.notes if run.has_baselines else (*run.notes, _NO_BASELINES)
     if as_json:
-        notes = {"notes": run.notes} if run.notes else {}
+        notes = {"notes": told} if told else {}
         print(json.dumps({"patches": _patches(run, deepest_m), **notes, "faults": faults}))
     else:
         for name, facts in _patches(run, deepest_m).items():
             depth_m = facts.pop("deepest_m")
             counts = "  ".join(f"{key} {value}" for key, value in facts.items())
             print(f"{name}  {counts}  deepest {1e6 * depth_m:.1f} µm")
-        for note in run.notes:
+        for note in told:
             print(f"note: {note}")
         for fault in faults:
             print(f"fault: {fault}")

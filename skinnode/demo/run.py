@@ -187,9 +187,10 @@ class _Progress:
         self._due_s = elapsed_s + _LINE_S
         errors = [watch.history[-1] for watch in self._watches if watch.history]
         shown = ", ".join(f"{1e6 * abs(depth):.0f}" for _, depth, _, _ in errors) or "-"
+        p99_text = f"{p99:.1f}" if latency.size else "-"
         self._console.print(
             f"{elapsed_s:5.1f} s  {received} frames, {lost} lost, {sum(torn.values())} torn, "
-            f"load {100 * load:.0f} %, frame-to-field latency p99 {p99:.1f} ms, depth {shown} µm",
+            f"load {100 * load:.0f} %, frame-to-field latency p99 {p99_text} ms, depth {shown} µm",
             soft_wrap=True,
         )
 

@@ -90,7 +90,7 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
         yield (
             "patches.calibration",
             "no calibrated forces: the standard deviations of normal forces are large enough to cover rubber "
-            "bonded to a rigid support (force_calibrated)",
+            "bonded to a rigid support; set force_calibrated after a test with known forces",
         )
     if solver.normal_only:
         yield "solver.normal_only", "no shear displacements and no shear forces"

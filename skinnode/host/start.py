@@ -8,7 +8,7 @@ from queue import SimpleQueue
 from typing import Final
 
 from skinnode.canopen.nmt import NmtState
-from skinnode.config import Missing, PatchConfig
+from skinnode.config import BusConfig, Missing, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
 from skinnode.host import nmt_master
 from skinnode.host.node_supervision import START_DEADLINE_S
@@ -218,9 +218,15 @@ def _silence(
     if len(silent) == len(on_bus):
         return BusError(
             f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: no response within "
-            f"{deadline_s:g} s from any node: {names}"
+            f"{deadline_s:g} s from any node: {names}{_of_one_process(bus)}"
         )
     return NodeTimeout(
         patch.node_id,
         f"patch {patch.name!r} on {bus.name}: no response within {deadline_s:g} s from {names}",
     )
+
+
+def _of_one_process(bus: BusConfig) -> str:
+    """Return a hint for an error message if nodes in another process cannot be reached on the bus."""
+    in_process = bus.interface == "virtual"
+    return "; the interface 'virtual' connects only nodes in the same process" if in_process else ""

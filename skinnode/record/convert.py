@@ -92,11 +92,11 @@ def convert(
 def _check(source: Path, target: Path, hand: HandConfig | None) -> None:
     """Raise ConfigError if the conversion is unsupported or a file to be created exists."""
     if source.suffix not in TARGETS:
-        raise ConfigError("source", str(source), _ending_in(TARGETS))
+        raise ConfigError("source", str(source), ending_in(TARGETS))
     allowed = TABLES if source.suffix in TABLES else TARGETS
     if target.suffix not in allowed:
         why = "; a field table contains no frames" if source.suffix in TABLES else ""
-        raise ConfigError("target", str(target), _ending_in(allowed) + why)
+        raise ConfigError("target", str(target), ending_in(allowed) + why)
     if source.suffix in TABLES and hand is not None:
         raise ConfigError("--hand", "a hand file", "only with a source that contains frames")
     taken = [target]
@@ -115,7 +115,8 @@ def _share_journal(source: Path, target: Path) -> bool:
     return both_logs and journal_of(source) == journal_of(target)
 
 
-def _ending_in(suffixes: tuple[str, ...]) -> str:
+def ending_in(suffixes: tuple[str, ...]) -> str:
+    """Return the allowed suffixes of a file as the text of an error message."""
     return f"a file ending in {', '.join(suffixes[:-1])} or {suffixes[-1]}"
 
 

@@ -210,7 +210,10 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], l
             parsed = parse_journal(str(path), path.name, _noted(lines, kept))
             return *parsed, kept
     except OSError as error:
-        allowed = f"a journal next to the log ({error.strerror}); for a log without a journal, give --hand"
+        allowed = (
+            f"a journal next to the log ({error.strerror}); for a log without a journal, give --hand to "
+            "skinnode replay, convert or resolve"
+        )
         raise ConfigError("recording", str(path), allowed) from None
 
 

@@ -108,8 +108,12 @@ def open_recording(path: Path) -> OpenRecording:
         name, buses = f"{path.name} journal", {bus.name: bus.name for bus in header.hand.buses}
     else:
         journal = journal_of(path)
-        header, events, complaints, raw = read_journal(journal)
-        frames = FrameLogReader(path)
+        frames = FrameLogReader(path)  # before the journal: if both are missing, the error names the log
+        try:
+            header, events, complaints, raw = read_journal(journal)
+        except ConfigError:
+            frames.close()
+            raise
         name, buses = journal.name, _channels_in(path, header.hand)
     lines = [line.decode("utf-8", "replace").rstrip("\n") for line in raw]
     return OpenRecording(frames, header, events, complaints, lines, name, ChannelMap(buses))

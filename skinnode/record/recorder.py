@@ -85,9 +85,9 @@ class Recorder:
 
     If recording begins before the host starts, a replay reproduces the fields bit for bit. A recording that
     begins while the host is running (:meth:`Host.tap`) lacks the initial state of the solvers. If an
-    exception ends the ``with`` block before the first frame, the empty recording is deleted. If the disk
-    fails (OSError), recording ends with a log message and the host continues. If writing an entry raises any
-    other exception, the rest of the entry is lost, and its frames are counted in ``dropped``.
+    exception ends the ``with`` block before the first frame has been received, the recording is deleted. If
+    the disk fails (OSError), recording ends with a log message and the host continues. If writing an entry
+    raises any other exception, the rest of the entry is lost, and its frames are counted in ``dropped``.
 
     Args:
         hand: The hand.
@@ -220,8 +220,8 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        # Delete an empty recording, because its files would make a retry fail.
-        if error is not None and not self._file.frames:
+        # Delete a recording of a silent bus, because its files would make a retry fail.
+        if error is not None and not any(self._at.values()):
             self._file.discard()
             if self._made is not None:
                 with suppress(OSError):  # another process may have written to the folder

@@ -81,11 +81,12 @@ def replay(
         speed: Replay speed relative to the recording: 2 is twice as fast; None replays as fast as possible.
         cancelled: Function called before each frame; returning True has the same effect as
             :meth:`Replay.stop`.
-        hand: Hand for a log without a journal, such as a candump log of another master; any journal is then
-            ignored. See :func:`skinnode.record.open_recording.open_log`.
+        hand: Hand for a log without a journal, such as a candump log of another master. See
+            :func:`skinnode.record.open_recording.open_log`.
 
     Raises:
-        ConfigError: The recording cannot be read, or ``speed`` is not positive.
+        ConfigError: The recording cannot be read, ``speed`` is not positive, or ``hand`` is given although
+            the recording has a journal.
     """
     path = Path(path)
     if speed is not None and not 0 < speed < float("inf"):
@@ -122,6 +123,8 @@ class Replay:
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = recording.frames
         """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
+        self.has_baselines = any(event["event"] == "resumed" for event in events)
+        """Whether the journal contains a baseline; if not, no scan can be decoded."""
         repairs = [event for event in events if event["event"] == "repaired"]
         ends = [event for event in events if event["event"] == "ended"] or repairs
         self.ended = bool(ends)

@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.process.clock import perf_counter
-from skinnode.solve.checks.data_check import DataCheck, Solved
+from skinnode.solve.checks.data_check import DataCheck
+from skinnode.solve.checks.linearised_readings import Solved
 from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.detect.rest_gate import RestGate
 from skinnode.solve.exact.contacts import ExactContacts

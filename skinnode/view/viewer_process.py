@@ -111,11 +111,15 @@ class ViewerProcess(Closing):
         raise SkinError(f"the viewer is not listening on port {port} after {_READY_S:.0f} s: {self.why()}")
 
 
-def require_viewer() -> None:
-    """Raise ConfigError if the package rerun-sdk is not installed."""
+def require_viewer(key: str = "skinnode view") -> None:
+    """Raise ConfigError if the package rerun-sdk is not installed.
+
+    Args:
+        key: Command or argument that requires the package, for the error message.
+    """
     if find_spec("rerun") is None or find_spec("rerun_bindings") is None:
         allowed = "the package rerun-sdk (sh install.sh view)"
-        raise ConfigError("skinnode view", Shown("no package rerun-sdk"), allowed)
+        raise ConfigError(key, Shown("no package rerun-sdk"), allowed)
 
 
 def require_display() -> None:

@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -104,6 +105,14 @@ def test_an_error_above_its_uncertainty_is_a_fault(monkeypatch: pytest.MonkeyPat
     report = _demo.play(unhurried_hand(), 2.0, quiet()).report
     # Where no scan came before it, the solver finds that no deformation explains any of them.
     assert report.faults[0].startswith(("palm: error", "palm: no scan solved")), report
+
+
+def test_a_line_before_the_first_field_contains_no_nan() -> None:
+    hand, written = demo_hand(1, seed=1), io.StringIO()
+    host = SimpleNamespace(stats=lambda: SimpleNamespace(patches={}, buses={}))
+    progress = _demo._Progress(Console(file=written), hand, [], 8.0)
+    progress.update(host, 1.0, 0)  # type: ignore[arg-type]
+    assert "latency p99 - ms, depth - µm" in written.getvalue()
 
 
 def test_the_view_shows_names_health_and_losses_in_80_columns() -> None:

@@ -257,7 +257,8 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
     channel = hand.buses[0].channel
     assert error_of(str(write_hand(tmp_path, "virtual", channel))) == (
         f"error: can0: interface 'virtual', channel '{channel}': no response within "
-        "3 s from any node: 11 (thumb), 12 (index)"
+        "3 s from any node: 11 (thumb), 12 (index); "
+        "the interface 'virtual' connects only nodes in the same process"
     )
 
 

@@ -202,7 +202,8 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(recorded: Path,
             "y.mcap",
             "allowed: a file ending in .parquet or .npz; a field table contains",
         ),
-        (recorded, "y.txt", "allowed: a file ending in .log, .blf, .asc, .mcap, .parquet or .npz"),
+        (recorded, "y.txt", "allowed: a file ending in .log, .blf, .asc, .mcap, .parquet, .npz or .rrd"),
+        (tmp_path / "x.npz", "y.rrd", "allowed: a file ending in .parquet or .npz; a field table contains"),
         (recorded, "x.npz", "allowed: a new file; this one exists and is not overwritten"),
         (recorded, "no/y.npz", "allowed: a file in an existing folder"),
         (tmp_path / "other.npz", "y.parquet", "allowed: an NPZ file of fields written by skinnode convert"),
@@ -214,6 +215,7 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(recorded: Path,
         (tmp_path / "text.parquet", "y.npz", "allowed: a Parquet file"),
         (tmp_path / "cut.npz", "y.parquet", "allowed: an "),
         (tmp_path / "none.log", "y.mcap", "for a log without a journal, give --hand"),
+        (tmp_path / "missing.log", "y.npz", "/missing.log', allowed: a file that can be read"),
         (tmp_path / "missing.mcap", "y.log", "a file that can be read (No such file or directory)"),
     ):
         done = CliRunner().invoke(app, ["convert", str(source), str(tmp_path / target)])
@@ -221,6 +223,14 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(recorded: Path,
         assert says in str(done.exception)
         assert "\n" not in str(done.exception)
         assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_missing_viewer_is_said_of_the_target(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skinnode.view.viewer_process.find_spec", lambda name: None)
+    done = CliRunner().invoke(app, ["convert", str(recorded), str(tmp_path / "run.rrd")])
+    assert str(done.exception).startswith("target: got no package rerun-sdk, allowed: ")
 
 
 def test_a_damaged_source_is_converted_as_far_as_it_is_whole(recorded: Path, tmp_path: Path) -> None:

@@ -247,6 +247,8 @@ def test_listening_writes_what_is_heard_and_sends_nothing(any_bus: BusConfig, tm
     assert heard == []
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert told[-1] == {"frames": len(numbers), "dropped": 0}
+    replayed = CliRunner().invoke(app, ["replay", str(path), "--fast"])
+    assert "note: the recording contains no baselines, as after skinnode record --listen; " in replayed.stdout
 
 
 HAND = """
@@ -276,6 +278,14 @@ def test_a_recording_that_cannot_begin_leaves_nothing_in_the_way(tmp_path: Path,
     CliRunner().invoke(app, asked)
     assert path.exists()
     assert path.with_suffix(".jsonl").exists()
+
+
+def test_a_recording_that_no_node_answers_leaves_nothing_in_the_way(tmp_path: Path) -> None:
+    hand = tmp_path / "hand.toml"
+    hand.write_text(HAND.replace('"wait"', '"refuse"'))
+    done = CliRunner().invoke(app, ["record", str(hand), "-o", str(tmp_path / "run.log")])
+    assert "no response within" in str(done.exception)
+    assert list(tmp_path.iterdir()) == [hand]
 
 
 def test_a_recording_without_a_field_is_a_fault_and_stays(tmp_path: Path) -> None:

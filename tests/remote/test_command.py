@@ -88,7 +88,7 @@ def test_a_second_daemon_is_refused_before_it_opens_a_bus(
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        (["--commands"], "--commands: got it, allowed: only with --publish"),
+        (["--commands"], "--commands: got no --publish, allowed: only with --publish"),
         (["--router", "tcp/robot:7447"], "--router: got 'tcp/robot:7447', allowed: only with --publish"),
         (["--zenoh-port", "9000"], "--zenoh-port: got 9000, allowed: only with --publish"),
         (["--publish", "--zenoh-port", "80"], "--zenoh-port: got 80, allowed: an integer from 1024 to 65520"),

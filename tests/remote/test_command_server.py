@@ -134,7 +134,9 @@ def tared(hand: sk.RunningHand, patch: str) -> bool:
     """Tare a patch; return False if the host refuses, because it is not operational."""
     try:
         hand.tare(patch)
-    except NodeError:
+    except NodeError as error:
+        if "not operational" not in str(error):
+            raise
         return False
     return True
 

@@ -250,6 +250,12 @@ def test_scenes_that_come_with_the_simulator(vcan_sim: Callable[..., Ended]) -> 
         assert read_scene(path).name in out
 
 
+def test_a_mistyped_scene_is_answered_with_the_names(vcan_sim: Callable[..., Ended], hand: Path) -> None:
+    status, out, err = vcan_sim(str(hand), "--scene", "prss")
+    assert (status, out) == (2, "")
+    assert err == "error: --scene: got 'prss', allowed: a scene file, or one of faults, press, taps\n"
+
+
 def test_help_names_the_commands(vcan_sim: Callable[..., Ended]) -> None:
     status, out, _ = vcan_sim("--help")
     assert status == 0

@@ -295,7 +295,11 @@ def table(**changes: Any) -> str:
     ("text", "place", "words"),
     [
         (table(where="plam"), "2:1", ["faults[0].where", "'plam'", "palm, thumb", "can0"]),
-        (table(where="palm upper 9", fault="open"), "3:1", ["faults[0].fault", "9", "from 0 to 3"]),
+        (
+            table(where="palm upper 9", fault="open"),
+            "2:1",
+            ["faults[0].where: got 'palm upper 9'", "from 0 to 3"],
+        ),
         (table(where="palm upper 2", fault="stuck"), "3:1", ["'stuck'", "open, shorted, noisy"]),
         (table(where="finger upper 2", fault="open"), "2:1", ["faults[0].where", "'finger upper 2'"]),
         (table(fault="lost_chunk=0.1"), "3:1", ["faults[0].fault", "'lost_chunk'", "lost"]),

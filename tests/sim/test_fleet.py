@@ -124,6 +124,8 @@ def test_counters_are_those_of_the_bus_and_a_tare_is_no_scan() -> None:
         manager.port.send(0x000, b"\x01\x00")
         frames = [frame for _ in range(3) for frame in manager.scan(5, 6)]
         after = fleet.report()
+        assert fleet.injected("p0").pdos >= 3 * 17
+        assert fleet.counts() == {"p0": {}, "p1": {}, "can0": {}}  # no faults
     assert [(r.patch, r.node_id, r.nmt_state, r.scans_sent) for r in after] == [
         ("p0", 5, NmtState.OPERATIONAL, 3),
         ("p1", 6, NmtState.OPERATIONAL, 3),

@@ -140,7 +140,13 @@ def test_bad_use_is_one_line(tmp_path: Path) -> None:
     both = test.format("patch", "'pinky', lost=0.1"), test.format("name", "'palm', loss=0.1")
     (tmp_path / "test_faults.py").write_text("\n\n".join(both))
     (tmp_path / "test_more.py").write_text("def test_no_hand(skin_host):\n    skin_host()\n")
-    printed = run(tmp_path, "test_more.py", "test_faults.py").stdout
+    early = "def test_early(skin_hand, skin_host, skin_truth):\n    skin_hand('hand.toml')\n"
+    (tmp_path / "test_early.py").write_text(f"{early}    skin_truth(skin_host().latest('palm'))\n")
+    bare = "import pytest\n\n\n@pytest.mark.skin_bus\ndef test_bare():\n    pass\n"
+    (tmp_path / "test_bare.py").write_text(bare)
+    printed = run(tmp_path, "test_more.py", "test_faults.py", "test_early.py", "test_bare.py").stdout
+    assert "ValueError: field: got None, must be a field from a host; wait for the first field" in printed
+    assert "skin_bus: got no bus, must be one or more of timed, virtual, udp_multicast, vcan0" in printed
     assert "skin_host: there is no hand yet; call skin_hand first" in printed
     assert "ConfigError: patch: got 'pinky', allowed: a patch of the hand: palm" in printed
     assert "ConfigError: loss: got an unknown fault, allowed: one of seed, lost, " in printed

@@ -106,6 +106,13 @@ def _check_together(
 
 def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:
     """Return a copy of an error that also gives the position of the fault in the scene file."""
+    where = scene.faults[number].where
+    wire = _WIRE.fullmatch(where)
+    if wire is not None and str(error.got) == wire["number"]:  # the patch has no such wire
+        key = f"faults[{number}].where"
+        bounds = error.allowed.rpartition("integer ")[2]
+        allowed = f"{wire['patch']} {wire['side']} with a number {bounds}"
+        return ConfigError(key, where, allowed, where=scene.where(key))
     key = f"faults[{number}].{'where' if error.key == 'where' else 'fault'}"
     shown = error.key.removeprefix("fault").strip()
     allowed = f"{shown}: {error.allowed}" if shown and error.key != "where" else error.allowed

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from skinnode.errors import ConfigError
+
 _FOLDER: Final = Path(__file__).with_name("shipped")
 
 
@@ -18,5 +20,13 @@ def scene_file(scene: Path) -> Path:
 
     Args:
         scene: Path of the file, or name of a shipped scene. An existing file takes precedence.
+
+    Raises:
+        ConfigError: ``scene`` has no suffix and is neither a file nor a shipped scene.
     """
-    return scene if scene.exists() else shipped_scenes().get(str(scene), scene)
+    if scene.exists():
+        return scene
+    shipped = shipped_scenes()
+    if str(scene) not in shipped and not scene.suffix:
+        raise ConfigError("--scene", str(scene), f"a scene file, or one of {', '.join(shipped)}")
+    return shipped.get(str(scene), scene)

@@ -16,7 +16,8 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.tolerances import EXACT
 from skinnode.process.clock import perf_counter
-from skinnode.solve.checks.data_check import DataCheck, Solved
+from skinnode.solve.checks.data_check import DataCheck
+from skinnode.solve.checks.linearised_readings import Solved
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 

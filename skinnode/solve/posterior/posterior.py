@@ -28,8 +28,8 @@ PLACED: Final = 2.0
 """Assumed error of a reading per pitch of placement error, as a fraction of the largest change in any
 reading."""
 RESOLVE: Final = 0.75
-"""Factor by which earlier frames must reduce the noise further for a frame to be solved again even if the last
-field explains it. The same applies if the noise increases by the reciprocal."""
+"""Factor by which earlier frames must reduce the noise further for a frame to be solved again even if the
+last field explains it. The same applies if the noise increases by the reciprocal."""
 DITHERED: Final = 2.0
 """Minimum ratio of a reading's noise to its quantization error for the mean of several readings to have a
 smaller quantization error than a single reading."""
@@ -67,6 +67,7 @@ class Posterior(FrameEstimator):
         noise = float(np.median(self._noise))
         self.check = DataCheck(self._problem, noise, _model_std(self.options), self.options.drift)
         self._past: FrameFilter | None = None
+        self._factor = 1.0  # noise factor of the frames in the filter
         self._solved_share = 1.0  # noise in the last solve, relative to the noise of its frame alone
         if self.options.past == "auto" and not self.options.estimate_noise:
             self._past = FrameFilter(layout, self._problem.a_rest)
@@ -130,6 +131,10 @@ class Posterior(FrameEstimator):
                 error = np.abs(rounding_ohm / np.asarray(frame_ohm, np.float64))
             least = np.where(readings.noise < DITHERED * error, error, 0.0)
         if self._past is not None:
+            factor = 1.0 if self.noise_estimate is None else self.noise_estimate.factor
+            if factor != self._factor:
+                self._past.forget()  # its noise was not as assumed
+            self._factor = factor
             self._past.next_frame()
 
         def solve(without: Mask | None = None) -> Solved:

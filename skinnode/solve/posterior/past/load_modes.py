@@ -30,9 +30,9 @@ class LoadModes:
     """(m,) variance of each mode if the loads change at random. Without the minimum :data:`LEAST_SHARE`, the
     sum would be 1."""
     weight: Float
-    """(m,) weight of each mode in the noise of the filtered readings: the square root of the share. The solver
-    assumes that the noise of all readings is independent. It is then stated for the modes of the loads, in
-    which the filter uses fewer frames."""
+    """(m,) weight of each mode in the noise of the filtered readings: the square root of the share. The
+    solver assumes that the errors of the readings are independent, but the filter uses fewer frames for the
+    modes of the loads. The noise is therefore stated for these modes."""
     total: Float
     """(m,) Σ weight mode² of each reading."""
 

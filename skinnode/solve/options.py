@@ -19,7 +19,7 @@ from skinnode.solve.inputs import CodeMap
 
 TRACKER_METHODS: Final = ("auto", "exact", "posterior")
 PRIORS: Final = ("cells", "discs")
-PASTS: Final = ("auto", "off")
+PASTS: Final = ("off", "auto")
 DRIFTS: Final = ("none", "patch", "wire")
 
 
@@ -61,8 +61,8 @@ class EstimateOptions:
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
             the loads are not local, ``discs`` falls back to ``cells``.
-        past: Whether the posterior also uses earlier frames: ``auto`` for readings with a noise of 1e-4 or
-            more, or ``off``. A sudden change in the loads takes effect in the same frame. Ignored if
+        past: Whether the posterior also uses earlier frames: ``off``, or ``auto`` if the noise of the
+            readings is 1e-4 or more. A sudden change in the loads takes effect in the same frame. Ignored if
             ``estimate_noise`` is set.
 
     Raises:
@@ -84,7 +84,7 @@ class EstimateOptions:
     hold: bool = True
     deadline_us: float | None = None
     prior: str = "cells"
-    past: str = "auto"
+    past: str = "off"
 
     def __post_init__(self) -> None:
         if self.drift not in DRIFTS:

@@ -12,7 +12,7 @@ The tracker estimates the noise of the stream and corrects the stated noise
 (:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker changes the method when the estimated noise
 crosses the limit for ``exact``. The new method starts at the rest position.
 
-In noise, the posterior also uses the readings of earlier frames (:mod:`skinnode.solve.posterior.past`), but
+On request, the posterior also uses the readings of earlier frames (:mod:`skinnode.solve.posterior.past`), but
 none from before an untouched frame or a gap in the stream.
 """
 

@@ -27,7 +27,7 @@ def small() -> sk.PatchLayout:
 
 @pytest.fixture(scope="module")
 def pressed(small: sk.PatchLayout) -> np.ndarray:
-    return hertz_press(small, 0.2)
+    return hertz_press(small, 0.2, centre_m=(8e-3, 8e-3))
 
 
 def noisy(ohm: np.ndarray, rng: np.random.Generator, sigma: float = SIGMA) -> np.ndarray:
@@ -83,9 +83,10 @@ def test_a_jump_of_the_loads_is_returned_as_it_is_in_the_same_frame(small):
     np.testing.assert_array_equal(found.noise, SIGMA)
 
 
-def test_a_slow_change_of_the_loads_is_followed_within_the_stated_noise(small):
+def test_a_slow_change_of_the_loads_lags_by_no_more_than_the_noise_of_a_frame_hides(small):
+    """Half a standard deviation per frame: after 23 frames, the last value before it is 11 away."""
     rng, way = np.random.default_rng(3), LoadModes.of(small).modes[-1]
-    deviations = []
+    lags = []
     for _ in range(20):
         past = FrameFilter(small, np.ones(small.shape))
         for frame in range(2 * HELD):
@@ -93,10 +94,33 @@ def test_a_slow_change_of_the_loads_is_followed_within_the_stated_noise(small):
             past.next_frame()
             found = past.filtered(readings(true + rng.standard_normal(small.shape)))
             if frame > HELD:
-                lag = float(way @ (changes(found) - true).ravel())
-                deviations.append(lag / float(np.sqrt(np.mean((found.noise / SIGMA) ** 2))))
-    assert np.sqrt(np.mean(np.square(deviations))) < 2.0
-    assert np.abs(deviations).max() < 6.0
+                lags.append(float(way @ (changes(found) - true).ravel()))
+    assert np.sqrt(np.mean(np.square(lags))) < 1.5
+    assert np.abs(lags).max() < 4.0
+
+
+def test_a_frame_repeated_without_wrong_readings_leaves_no_trace_of_them(small):
+    """The data check solves a frame again without the readings that it finds to be wrong."""
+    rng = np.random.default_rng(6)
+    faulty, sound = (FrameFilter(small, np.ones(small.shape)) for _ in range(2))
+    without = np.zeros(small.shape, bool)
+    without[2, 4] = True
+    for frame in range(HELD):
+        y = rng.standard_normal(small.shape)
+        found = []
+        for past in (faulty, sound):
+            past.next_frame()
+            wrong = y.copy()
+            if frame == HELD - 4:
+                wrong[2, 4] += 300.0
+                if past is faulty:
+                    assert changes(past.filtered(readings(wrong)))[2, 4] > 250.0
+                found.append(past.filtered(readings(wrong).except_for(without)))
+            else:
+                found.append(past.filtered(readings(y)))
+        np.testing.assert_array_equal(found[0].a, found[1].a)
+        np.testing.assert_array_equal(found[0].noise, found[1].noise)
+    assert found[0].noise.mean() < 0.6 * SIGMA
 
 
 def test_a_repeated_frame_of_a_frozen_converter_does_not_reduce_the_noise(small):
@@ -145,32 +169,26 @@ def test_a_held_press_gains_and_a_sudden_release_does_not_lag(small, pressed):
         inside += np.count_nonzero(np.abs(field.displacement_m - pressed) <= field.half_width_95_m)
         count += pressed.size
         frame = noisy(rest, rng)
-        field, single = auto.update(frame), off.update(frame)
+        field, alone = auto.update(frame), posterior(small, "off").update(frame)
         assert (np.abs(field.displacement_m) <= 5.0 * field.displacement_std_m).all()
-        assert field.displacement_std_m.mean() > 0.7 * single.displacement_std_m.mean()
+        assert field.displacement_std_m.mean() > 0.7 * alone.displacement_std_m.mean()
         assert np.abs(field.displacement_m).max() < 0.3 * np.abs(pressed).max()
     assert np.mean(own) < 0.75 * np.mean(without)
     assert inside > 0.9 * count
 
 
-def test_a_wrong_reading_does_not_affect_later_frames(small, pressed):
-    held = frame_ohm(small, pressed)
-    rng = np.random.default_rng(7)
-    frames = [noisy(held, rng) for _ in range(HELD)]
-    fields = {}
-    for faulty in (False, True):
-        tracker = posterior(small)
-        for number, frame in enumerate(frames):
-            wrong = frame.copy()
-            if faulty and number == HELD - 3:
-                wrong[2, 4] *= 1.3
-            fields[faulty] = tracker.update(wrong)
-            if faulty and number == HELD - 3:
-                assert [(fault.upper, fault.lower) for fault in fields[True].faults] == [(2, 4)]
-    gap = np.abs(fields[True].displacement_m - fields[False].displacement_m)
-    assert (gap < fields[False].displacement_std_m).all()
-    ratio = fields[True].displacement_std_m / fields[False].displacement_std_m
-    assert ratio.max() < 1.5
+def test_a_wrong_reading_is_named_and_does_not_spoil_the_fields(small, pressed):
+    held, rng = frame_ohm(small, pressed), np.random.default_rng(7)
+    tracker = posterior(small)
+    for number in range(HELD):
+        frame = noisy(held, rng)
+        if number == HELD - 4:
+            frame[2, 4] *= 1.3
+        field = tracker.update(frame)
+        if number == HELD - 4:
+            assert {fault.upper for fault in field.faults} == {2}
+        if number >= HELD - 4:
+            assert (np.abs(field.displacement_m - pressed) <= 5.0 * field.displacement_std_m).all()
 
 
 def test_little_noise_is_solved_frame_by_frame(small, pressed):
@@ -185,7 +203,9 @@ def test_little_noise_is_solved_frame_by_frame(small, pressed):
 
 def test_frames_before_a_gap_or_a_reset_are_not_used(small, pressed):
     held, rng = frame_ohm(small, pressed), np.random.default_rng(9)
-    tracker = sk.Tracker(small, method="posterior", relative_noise=SIGMA, follow_noise=False, detect=False)
+    tracker = sk.Tracker(
+        small, method="posterior", relative_noise=SIGMA, follow_noise=False, detect=False, past="auto"
+    )
     stds, period_ns = [], 80_000_000
     for number in range(HELD + 1):
         tracker.t_ns = number * period_ns + (10**10 if number == HELD else 0)

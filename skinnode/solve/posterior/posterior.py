@@ -1,6 +1,6 @@
 """Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
 
-In noise, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame with those of earlier
+On request, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame with those of earlier
 frames. ``frame_estimator`` then solves the frame, and :mod:`skinnode.solve.checks.data_check` tests whether
 the readings of the frame itself contradict each other. If some readings are wrong, the frame is solved again
 without them.
@@ -139,7 +139,7 @@ class Posterior(FrameEstimator):
 
         def solve(without: Mask | None = None) -> Solved:
             kept = readings if without is None else readings.except_for(without)
-            field = self._estimate(self._with_past(kept, least), start)
+            field = self._estimate(self._with_past(kept, least), start, kept)
             return Solved(field, a, self._hyper.noise_factor * kept.noise, kept.usable)
 
         return self.check.check(solve(), solve, start + self._seconds)

@@ -43,6 +43,14 @@ JUMPED: Final = 0.5
 """Probability of a jump above which a frame is solved as it is."""
 
 
+SURPRISE: Final = 5.0
+"""Change along one mode or of one coordinate, in standard deviations, above which the filter forgets the
+past. The banks expect changes in many cells at once. Without this test, slow movements of a single electrode
+under a small body went unnoticed, and errors reached 10 standard deviations."""
+RECENT: Final = 0.25
+"""Weight of the last frame in the mean change that is tested besides the change of the last frame."""
+
+
 class FrameFilter:
     """Filter over the frames of one patch. Each stream needs its own instance.
 
@@ -55,7 +63,7 @@ class FrameFilter:
     """
 
     def __init__(self, layout: PatchLayout, a_rest: Float) -> None:
-        modes = LoadModes.of(layout)
+        self._modes = modes = LoadModes.of(layout)
         m, banks = a_rest.size, SPEEDS.size + 1
         self._a_rest = a_rest
         self._arrays = FilterArrays(
@@ -83,6 +91,8 @@ class FrameFilter:
         )
         start(self._arrays.table)  # compile the kernels
         filter_frame(self._arrays.table, 1.0)
+        self._change = np.zeros((m, 2))  # last and mean recent change, in units of the noise
+        self._next_change = np.zeros((m, 2))
         self._mean = np.zeros(m)  # filtered changes before the frame, in units of the noise
         self.forget()
 
@@ -92,13 +102,16 @@ class FrameFilter:
         self._next_sigma = 0.0
         self._used = self._next_used = np.zeros(self._a_rest.shape, bool)
         self._last_a = self._next_a = self._a_rest
+        self._next_change[:] = 0.0
+        self._spread = 1.0  # mean variance of the filtered changes before the frame
         self._shift: Float | None = None  # readings of the last frame that were not usable before it
 
     def next_frame(self) -> None:
         """Accept the last frame; the frames filtered from now on follow it."""
         its = self._arrays
         its.state[:], its.variance[:], its.chance[:] = its.next_state, its.next_variance, its.next_chance
-        self._mean[:] = its.filtered
+        self._spread = min(float(its.noise.mean()), 1.0)
+        self._mean[:], self._change[:] = its.filtered, self._next_change
         self._sigma, self._used, self._last_a = self._next_sigma, self._next_used, self._next_a
         if self._shift is not None:
             self._restart(self._shift)
@@ -128,6 +141,7 @@ class FrameFilter:
         its.frame[:] = (np.log(self._a_rest / readings.a) / sigma).ravel()
         if self._sigma == 0.0:
             start(its.table)
+            self._next_change[:] = 0.0
             return readings
         self._rescale(self._sigma / sigma)
         fresh = used & ~self._used
@@ -136,12 +150,10 @@ class FrameFilter:
         ignored = ~past.ravel()
         if ignored.any():
             its.frame[ignored] = self._mean[ignored]
-        jumped = filter_frame(its.table, max(1.0 / MOST_FRAMES, (LEAST_NOISE / sigma) ** 2))
-        if jumped > JUMPED:
-            its.filtered[:] = its.frame
+        jumped = self._advance(max(1.0 / MOST_FRAMES, (LEAST_NOISE / sigma) ** 2))
         if fresh.any():
             self._shift = np.where(fresh.ravel(), new - its.filtered, 0.0)
-        if jumped > JUMPED:
+        if jumped:
             return readings
         shape = readings.a.shape
         a = self._a_rest * np.exp(-sigma * its.filtered.reshape(shape))
@@ -149,6 +161,31 @@ class FrameFilter:
         if least is not None:
             noise = np.maximum(noise, least)
         return Readings(np.where(past, a, readings.a), np.where(past, noise, readings.noise), used)
+
+    def _advance(self, least: float) -> bool:
+        """Filter the frame; return whether the skin jumped, so that the frame is used alone.
+
+        Args:
+            least: Minimum variance of a filtered mode, in units of the noise variance.
+        """
+        its = self._arrays
+        if self._has_changed():
+            start(its.table)
+        elif filter_frame(its.table, least) > JUMPED:
+            its.filtered[:], its.noise[:] = its.frame, 1.0
+        else:
+            return False
+        self._next_change[:] = 0.0
+        return True
+
+    def _has_changed(self) -> bool:
+        """Return whether the last frame, or the mean of the last few, differs from the filtered readings."""
+        change = self._next_change
+        change[:, 0] = self._arrays.frame - self._mean
+        change[:, 1] = (1.0 - RECENT) * self._change[:, 1] + RECENT * change[:, 0]
+        variance = 1.0 + self._spread
+        one, recent = self._modes.largest(change) ** 2 / variance
+        return bool(max(one, recent * (2.0 - RECENT) / RECENT) > SURPRISE**2)
 
     def _rescale(self, ratio: float) -> None:
         """Express the state before the frame in units of another noise; ``ratio`` is old noise / new."""
@@ -158,6 +195,8 @@ class FrameFilter:
         its.state *= ratio
         its.variance *= ratio**2
         self._mean *= ratio
+        self._change *= ratio
+        self._spread *= ratio**2
         self._sigma /= ratio
 
     def _restart(self, shift: Float) -> None:

@@ -168,7 +168,7 @@ def truth(family: str, skin: Skin, number: int) -> list[tuple[str, Float]]:
                 part = math.expm1(-CREEP * part) / math.expm1(-CREEP)
             left = min(int(part * STEPS), STEPS - 1)
             between = part * STEPS - left
-            frames.append((phase.name, (1.0 - between) * knots[left] + between * knots[left + 1]))
+            frames.append((phase.name, knots[left] + between * (knots[left + 1] - knots[left])))
         share, shift = phase.share, phase.shift
     return frames
 

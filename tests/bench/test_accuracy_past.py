@@ -25,7 +25,8 @@ def test_a_press_is_held_slides_deepens_and_is_released(family, number):
     assert depths[-1] / depths[0] > 1.05
     assert depths[1] - depths[0] > 3.0 * (depths[-1] - depths[-2])  # creep slows down
     release = [np.abs(moved).max() for moved in phases["slow release"]]
-    assert release[-1] == pytest.approx(0.3 / 0.95 * release[0], rel=0.2)
+    assert (np.diff(release) < 0.0).all()
+    assert release[-1] < 0.4 * release[0]
 
 
 def test_a_frame_counts_the_coordinates_within_and_far_beyond_its_claim():

@@ -8,6 +8,7 @@ and a plate over the whole patch exist only in closed form.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -51,8 +52,14 @@ class Scene:
     """Whether the skin is a bonded layer of the simulator."""
 
 
-def draw(
-    family: str, skin: Skin, rng: np.random.Generator, *, bonded: bool = False, depth: float | None = None
+def draw(  # noqa: PLR0913 - the parts of a scene
+    family: str,
+    skin: Skin,
+    rng: np.random.Generator,
+    *,
+    bonded: bool = False,
+    depth: float | None = None,
+    shift_m: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
     """Return a random scene of a family.
 
@@ -62,17 +69,28 @@ def draw(
         rng: Random generator.
         bonded: Whether the body presses on a bonded layer; only for the families in :data:`BONDED`.
         depth: Depth divided by the height of the upper layer; random by default.
+        shift_m: Displacement of the loads from their random positions, in metres. With the same state of the
+            generator and a given depth, only the depth and the position of the loads change.
     """
     layout = skin.layout
     loads: tuple[Load, ...] = (
         _pair(layout, rng, depth) if family == "two" else (trust_loads.draw(family, layout, rng, depth),)
     )
+    loads = tuple(_shifted(load, shift_m) for load in loads)
     centers = tuple((float(load.center_m[0]), float(load.center_m[1])) for load in loads)
     if bonded and family in BONDED:
         kind = "sphere" if family in ("edge", "two") else family
         return _on_layer(kind, layout, loads, rng)
     truth = skin.displacement_m(loads, 1.0)
     return Scene(truth, centers, np.sum([load.force_n(1.0) for load in loads], axis=0), bonded=False)
+
+
+def _shifted(load: Load, shift_m: tuple[float, float]) -> Load:
+    if shift_m == (0.0, 0.0):
+        return load
+    x, y = load.center_m
+    moved: Load = dataclasses.replace(load, center_m=(x + shift_m[0], y + shift_m[1]))  # type: ignore[type-var]
+    return moved
 
 
 def _pair(layout: PatchLayout, rng: np.random.Generator, depth: float | None) -> tuple[Load, Load]:

@@ -185,12 +185,16 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
     only: Annotated[
-        Literal["detection", "families"] | None,
+        Literal["detection", "families", "past"] | None,
         typer.Option(
-            help="Run only this part: the touch detector, or both priors on families of loads that neither "
-            "expects. For families, --scenes counts the scenes per family, layout and noise level."
+            help="Run only this part: the touch detector, both priors on families of loads that neither "
+            "expects, or streams with and without earlier frames. For families, --scenes counts the scenes "
+            "per family, layout and noise level; for past, the scenes per family."
         ),
     ] = None,
+    prior: Annotated[
+        Literal["cells", "discs"], typer.Option(help="Prior of the loads in the part `past`.")
+    ] = "cells",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,
     presses: Annotated[
         int, typer.Option(min=1, help="Number of presses per row of the part `detection`.")
@@ -203,8 +207,9 @@ def accuracy(
 
     The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
     `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
-    false alarms occur. The exit status is 1 if a requirement is not met. No requirement limits a time,
-    because times depend on the machine.
+    false alarms occur. With `--only past`, it measures what earlier frames contribute to an estimate. The
+    exit status is 1 if a requirement is not met. No requirement limits a time, because times depend on the
+    machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)
@@ -212,10 +217,13 @@ def accuracy(
     from skinnode.bench import accuracy as bench
 
     _prepare(json, plot)
-    if only == "families":
+    if only is not None:
         if plot is not None:
-            raise typer.BadParameter("got --plot, which --only families cannot draw", param_hint="--plot")
-        figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
+            raise typer.BadParameter(f"got --plot, which --only {only} cannot draw", param_hint="--plot")
+        if only == "families":
+            figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
+        else:
+            figures = bench.run_past(scenes, prior, lambda line: typer.echo(line, err=True))
     else:
         figures = bench.run(scenes, rounds)
     _print_machine(figures)

@@ -35,6 +35,7 @@ _KERNEL_FILES = (
     "solve/*.py",
     "solve/*/*.py",
     "solve/posterior/local/*.py",
+    "solve/posterior/past/*.py",
     "bus_load/stuffing*.py",
     "host/repeated_codes.py",
 )

@@ -11,6 +11,7 @@ from skinnode.config.table import Allowed, Stiffness, Table, one_of
 Method = Literal["auto", "exact", "posterior"]
 Operator = Literal["gauss_newton", "levenberg_marquardt", "dogleg"]
 Drift = Literal["none", "patch", "wire"]
+Past = Literal["off", "auto"]
 Partial = Literal["pass", "withhold"]
 
 
@@ -35,6 +36,9 @@ class SolverConfig(Table):
     drift: Annotated[Drift, one_of(Drift)] = "none"
     """Estimate the drift of the resistances together with the displacement: as one gain for the whole
     ``patch``, or one gain for each upper ``wire``. Requires the method ``posterior``."""
+    past: Annotated[Past, one_of(Past)] = "off"
+    """Use earlier scans: with ``auto``, the method ``posterior`` combines each scan with earlier scans if the
+    noise is 1e-4 or more; with ``off``, every scan is solved alone."""
     normal_only: bool = False
     """Solve only for the z displacement of the electrodes, not for shear."""
     max_std_m: Annotated[

@@ -120,6 +120,7 @@ def tracker_options(
         deadline_us=config.deadline_us,
         estimate_noise=config.estimate_noise,
         drift=config.drift,
+        past=config.past,
         normal_only=config.normal_only,
         max_std_m=config.max_std_m,
         max_force_std_n=config.max_force_std_n,

@@ -19,6 +19,7 @@ from skinnode.solve.inputs import CodeMap
 
 TRACKER_METHODS: Final = ("auto", "exact", "posterior")
 PRIORS: Final = ("cells", "discs")
+PASTS: Final = ("off", "auto")
 DRIFTS: Final = ("none", "patch", "wire")
 
 
@@ -60,6 +61,9 @@ class EstimateOptions:
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
             the loads are not local, ``discs`` falls back to ``cells``.
+        past: Whether the posterior also uses earlier frames: ``off``, or ``auto`` if the noise of the
+            readings is 1e-4 or more. A sudden change in the loads takes effect in the same frame. Ignored if
+            ``estimate_noise`` is set.
 
     Raises:
         ValueError: If an option is out of range.
@@ -80,12 +84,15 @@ class EstimateOptions:
     hold: bool = True
     deadline_us: float | None = None
     prior: str = "cells"
+    past: str = "off"
 
     def __post_init__(self) -> None:
         if self.drift not in DRIFTS:
             raise ValueError(f"drift: got {self.drift!r}, must be one of {', '.join(DRIFTS)}")
         if self.prior not in PRIORS:
             raise ValueError(f"prior: got {self.prior!r}, must be one of {', '.join(PRIORS)}")
+        if self.past not in PASTS:
+            raise ValueError(f"past: got {self.past!r}, must be one of {', '.join(PASTS)}")
         require_positive("drift_std", self.drift_std)
         if not (math.isfinite(self.model_error) and self.model_error >= 0):
             raise ValueError(f"model_error: got {self.model_error}, must be finite and at least 0")
@@ -211,6 +218,7 @@ class EstimateArguments(TypedDict, total=False):
     hold: bool
     deadline_us: float | None
     prior: str
+    past: str
 
 
 class PosteriorArguments(EstimateArguments, total=False):

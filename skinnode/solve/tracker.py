@@ -11,6 +11,9 @@ untouched patch is not solved.
 The tracker estimates the noise of the stream and corrects the stated noise
 (:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker changes the method when the estimated noise
 crosses the limit for ``exact``. The new method starts at the rest position.
+
+On request, the posterior also uses the readings of earlier frames (:mod:`skinnode.solve.posterior.past`), but
+none from before an untouched frame or a gap in the stream.
 """
 
 from __future__ import annotations
@@ -47,6 +50,8 @@ EXACT_STD: Final = 0.0025
 With 16-bit codes, the standard deviation is 0.0005 on the staggered layout with h = 0.5, and 0.05 on the
 aligned layout.
 """
+GAP_NS: Final = 2_000_000_000
+"""Interval between two frames, ns, above which frames before the gap are not used."""
 
 
 class Tracker:
@@ -65,7 +70,8 @@ class Tracker:
         method: Method in use, ``exact`` or ``posterior``. With ``auto``, it can change during a stream.
         reason: Short explanation of why this method is in use.
         t_ns: Time of the next frame on any monotonic clock, ns. After a gap in the stream, the detector
-            allows for drift in the meantime; if None (the default), gaps are not noticed.
+            allows for drift in the meantime, and the posterior uses no earlier frames; if None (the default),
+            gaps are not noticed.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -81,6 +87,7 @@ class Tracker:
         self.layout = layout
         self.method, self.reason = self._chosen = choose_method(layout, options)
         self.t_ns: int | None = None
+        self._last_ns: int | None = None
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
@@ -168,6 +175,7 @@ class Tracker:
             ValueError: If an argument has the wrong shape.
         """
         start = perf_counter()
+        self._note_gap()
         if self._rest is not None:
             ohm = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
             mask = None if valid is None else checked_mask(valid, self.layout)
@@ -200,6 +208,7 @@ class Tracker:
         start, meaning = perf_counter(), self.options.codes
         if meaning is None:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
+        self._note_gap()
         if self._rest is not None:
             assert self._decoder is not None  # the option ``codes`` is set
             ohm, _, invalid = self._decoder.decode(checked_codes(codes, self.layout))
@@ -236,6 +245,13 @@ class Tracker:
         if self._exact is not None:
             self._check.scan = number
 
+    def _note_gap(self) -> None:
+        """Make the posterior forget the frames before a gap in the stream."""
+        now, last = self.t_ns, self._last_ns
+        self._last_ns = now
+        if now is not None and last is not None and not 0 <= now - last <= GAP_NS:
+            self._posterior.forget_past()
+
     def _at_rest(
         self, ohm: Float, valid: NDArray[np.bool_] | None, noise: Float | None, codes: CodeMap | None = None
     ) -> FieldFrame | None:
@@ -248,6 +264,7 @@ class Tracker:
         if field is None:
             return None
         check.pass_frame()
+        self._posterior.forget_past()  # the next touch need not resemble the last
         stated = noise
         if stated is None:
             stated = self._stated if codes is None else self._stated_of_codes

@@ -128,6 +128,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             0,
             "solver.false_alarms_per_hour: got 0, allowed: a number from 1e-6 to 1e4 (1/h)",
         ),
+        (["solver", "past"], "on", "solver.past: got 'on', allowed: off or auto"),
         (
             ["sync", "overflow"],
             240,

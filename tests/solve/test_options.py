@@ -47,6 +47,7 @@ def test_options_and_keywords_give_the_same_tracker_and_keywords_win(layout):
     [
         ("method", "best", "must be one of auto, exact, posterior"),
         ("drift", "some", "must be one of none, patch, wire"),
+        ("past", "on", "must be one of off, auto"),
         ("drift_std", 0.0, "must be positive and finite"),
         ("model_error", -0.1, "must be finite and at least 0"),
         ("deadline_us", math.inf, "must be positive and finite"),

@@ -45,6 +45,7 @@ _KERNELS: Final = (
     "solve/*.py",
     "solve/*/*.py",
     "solve/posterior/local/*.py",
+    "solve/posterior/past/*.py",
     "bus_load/stuffing*.py",
 )  # as in skinnode.compiled.jit
 _MEMORY_BYTES: Final = 8 << 30

@@ -201,13 +201,22 @@ class FrameEstimator:
         start = perf_counter()
         return self._estimate(self._readings(frame_ohm, valid, relative_noise, None), start)
 
-    def _estimate(self, readings: Readings, start: float) -> FieldFrame:
+    def _estimate(self, readings: Readings, start: float, alone: Readings | None = None) -> FieldFrame:
+        """Estimate the field of one frame.
+
+        Args:
+            readings: The frame.
+            start: Time at which the update began, s.
+            alone: The frame without the information of earlier frames, which determines the minimum prior
+                scale; the same as ``readings`` if None. Changes that a single frame does not show may not
+                have reached the filtered readings yet.
+        """
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
         estimator.until = min(start + self._seconds, self._until)
         estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
         observation = self._observe(readings)
-        self._hyper.set_least(observation)
+        self._hyper.set_least(observation if alone is None else self._observe(alone))
         try:
             if self._is_quiet(observation):
                 held = np.ones(len(self._wires), bool)

@@ -1,7 +1,9 @@
 """Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
 
-``frame_estimator`` solves each frame. :mod:`skinnode.solve.checks.data_check` then tests whether the readings
-contradict each other. If some readings are wrong, the frame is solved again without them.
+On request, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame with those of earlier
+frames. ``frame_estimator`` then solves the frame, and :mod:`skinnode.solve.checks.data_check` tests whether
+the readings of the frame itself contradict each other. If some readings are wrong, the frame is solved again
+without them.
 """
 
 from __future__ import annotations
@@ -20,10 +22,18 @@ from skinnode.solve.checks.data_check import DataCheck
 from skinnode.solve.checks.linearised_readings import Solved
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
+from skinnode.solve.posterior.observation import Readings
+from skinnode.solve.posterior.past.frame_filter import FrameFilter
 
 PLACED: Final = 2.0
 """Assumed error of a reading per pitch of placement error, as a fraction of the largest change in any
 reading."""
+RESOLVE: Final = 0.75
+"""Factor by which earlier frames must reduce the noise further for a frame to be solved again even if the
+last field explains it. The same applies if the noise increases by the reciprocal."""
+DITHERED: Final = 2.0
+"""Minimum ratio of a reading's noise to its quantization error for the mean of several readings to have a
+smaller quantization error than a single reading."""
 
 
 class Posterior(FrameEstimator):
@@ -57,12 +67,26 @@ class Posterior(FrameEstimator):
         super().__init__(layout, merged(PosteriorOptions, options, arguments))
         noise = float(np.median(self._noise))
         self.check = DataCheck(self._problem, noise, _model_std(self.options), self.options.drift)
+        self._past: FrameFilter | None = None
+        self._factor = 1.0  # noise factor of the frames in the filter
+        self._solved_share = 1.0  # noise in the last solve, relative to the noise of its frame alone
+        if self.options.past == "auto" and not self.options.estimate_noise:
+            self._past = FrameFilter(layout, self._problem.a_rest)
         self.warm_up()
 
     def reset(self) -> None:
         """Discard the state of the stream; the next frame is solved from rest."""
         super().reset()
         self.check.reset()
+        self.forget_past()
+
+    def forget_past(self) -> None:
+        """Solve the next frame without the readings of earlier frames.
+
+        Call this method if frames are missing from the stream.
+        """
+        if self._past is not None:
+            self._past.forget()
 
     def update(
         self,
@@ -72,6 +96,8 @@ class Posterior(FrameEstimator):
         rounding_ohm: Float | None = None,
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
+
+        With the option ``past``, the estimate also uses the readings of earlier frames.
 
         No resistance value raises an exception. If a wire has no usable resistances, its displacement is
         estimated from its neighbours, and its standard deviation is larger. If no deformation explains the
@@ -100,12 +126,36 @@ class Posterior(FrameEstimator):
         with np.errstate(over="ignore", invalid="ignore"):
             a = np.asarray(frame_ohm, np.float64) * self._problem.gain
 
+        least = None
+        if rounding_ohm is not None:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                error = np.abs(rounding_ohm / np.asarray(frame_ohm, np.float64))
+            least = np.where(readings.noise < DITHERED * error, error, 0.0)
+        if self._past is not None:
+            factor = 1.0 if self.noise_estimate is None else self.noise_estimate.factor
+            if factor != self._factor:
+                self._past.forget()  # its noise was not as assumed
+            self._factor = factor
+            self._past.next_frame()
+
         def solve(without: Mask | None = None) -> Solved:
             kept = readings if without is None else readings.except_for(without)
-            field = self._estimate(kept, start)
+            field = self._estimate(self._with_past(kept, least), start, kept)
             return Solved(field, a, self._hyper.noise_factor * kept.noise, kept.usable)
 
         return self.check.check(solve(), solve, start + self._seconds)
+
+    def _with_past(self, readings: Readings, least: Float | None) -> Readings:
+        """Return the readings of a frame, estimated from this frame and those before it."""
+        if self._past is None:
+            return readings
+        found = self._past.filtered(readings, least)
+        used = found.usable
+        share = float(found.noise[used].sum() / readings.noise[used].sum()) if used.any() else 1.0
+        if not RESOLVE * self._solved_share <= share <= self._solved_share / RESOLVE:
+            self._seen = np.zeros_like(self._seen)
+            self._solved_share = share
+        return found
 
 
 def _model_std(options: PosteriorOptions) -> float:

@@ -26,13 +26,13 @@ FLOOD_COB_ID: Final = 0x001
 FLOOD_DATA: Final = bytes([0x55] * 8)
 _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
-"""Minimum interval between batches of rogue frames, ns."""
+"""Minimum interval between batches of rogue frames, in ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""How far ahead flood frames are queued, ns. This prevents gaps on a fully starved bus."""
+"""How far ahead flood frames are queued, in ns. This prevents gaps on a fully starved bus."""
 _MOST_AT_ONCE: Final = 256
 """Maximum number of overdue rogue frames of one kind in a batch. The rest are dropped."""
 _RETRY_S: Final = 0.05
-"""Time from a bus error until the rogue device reopens its endpoint, s."""
+"""Time from a bus error until the rogue device reopens its endpoint, in s."""
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240

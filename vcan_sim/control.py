@@ -27,9 +27,9 @@ from skinnode.errors import ConfigError, SkinError
 
 _LONGEST_LINE: Final = 1 << 16
 _ANSWER_S: Final = 10.0
-"""Time-out for the response of a simulator, s."""
+"""Time-out for the response of a simulator, in s."""
 _POLL_S: Final = 0.2
-"""Interval at which the server thread checks whether to stop, s."""
+"""Interval at which the server thread checks whether to stop, in s."""
 KEY: Final = "inject"
 """Key under which error messages report invalid requests."""
 

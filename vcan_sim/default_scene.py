@@ -85,7 +85,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time of the first touch, s. Patches differ by up to a quarter of a cycle."""
+        """Scene time of the first touch, in s. Patches differ by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:

@@ -39,7 +39,7 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
         super().__init__(_Selector(self._woken.wait, self._woken.clear))
 
     def time(self) -> float:
-        """Return the monotonic time of the thread, s."""
+        """Return the monotonic time of the thread, in s."""
         return clock.monotonic()
 
     def call_soon_threadsafe(

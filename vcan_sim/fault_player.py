@@ -32,7 +32,7 @@ class FaultPlayer:
         """Begin the schedule. Call this method only once.
 
         Args:
-            origin_ns: Monotonic time at scene time 0, ns.
+            origin_ns: Monotonic time at scene time 0, in ns.
         """
         self._inbox.put(origin_ns)
 

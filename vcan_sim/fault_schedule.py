@@ -10,7 +10,7 @@ from typing import Final
 from vcan_sim.fault_text import Value
 
 CLOSE_S: Final = 1e-9
-"""Tolerance for rounding errors in scene times, s."""
+"""Tolerance for rounding errors in scene times, in s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,9 +23,9 @@ class TimedFault:
     """Name of the faulty patch or bus."""
     on_bus: bool
     from_s: float
-    """Scene time at which the faults start, s."""
+    """Scene time at which the faults start, in s."""
     to_s: float
-    """Scene time at which the faults end, s; inf if they last until the end of the simulation."""
+    """Scene time at which the faults end, in s; inf if they last until the end of the simulation."""
     values: Mapping[str, Value] = field(hash=False)
     """Values of the faults, by name."""
 
@@ -36,13 +36,13 @@ class FaultSchedule:
 
     faults: tuple[TimedFault, ...] = ()
     repeat_s: float | None = None
-    """Period of the scene, s; None if the scene plays once."""
+    """Period of the scene, in s; None if the scene plays once."""
 
     def active(self, t_s: float) -> tuple[TimedFault, ...]:
         """Return the faults active at a scene time, in the order of the scene file.
 
         Args:
-            t_s: Scene time, s. At negative scene times, no faults are active.
+            t_s: Scene time, in s. At negative scene times, no faults are active.
         """
         if t_s < -CLOSE_S:
             return ()
@@ -53,7 +53,7 @@ class FaultSchedule:
         """Return the next scene time (s) at which a fault starts or ends; None if no fault does.
 
         Args:
-            t_s: Current scene time, s.
+            t_s: Current scene time, in s.
         """
         at_s = self._within(t_s) if t_s >= 0.0 else t_s
         times = {time for each in self.faults for time in (each.from_s, each.to_s) if math.isfinite(time)}

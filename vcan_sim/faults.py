@@ -190,7 +190,7 @@ class Faults:
     """Whether a second node on the bus has the same node-ID. The second node boots, responds to all commands
     and reports skin at rest. It disappears when the fault ends."""
     restart_every_s: float = 0.0
-    """Interval between spontaneous resets of the node, s; 0 for no resets."""
+    """Interval between spontaneous resets of the node, in s; 0 for no resets."""
     emcy_per_s: float = 0.0
     """Rate of spurious emergency messages, 1/s. When the fault ends, the node sends an *error reset*
     message."""

@@ -260,7 +260,7 @@ class Fleet:
 
         Args:
             patch: Name of the patch.
-            device_time_us: Device time in the scan's summary, µs.
+            device_time_us: Device time in the scan's summary, in µs.
 
         Returns:
             (U, N, 3) float64, m: positions including the imperfections of the patch.
@@ -275,7 +275,7 @@ class Fleet:
 
         Args:
             patch: Name of the patch.
-            device_time_us: Device time in the scan's summary, µs.
+            device_time_us: Device time in the scan's summary, in µs.
 
         Returns:
             (U, N, 3) float64, m: :meth:`truth_m` minus the true positions at rest.
@@ -297,7 +297,7 @@ class Fleet:
 
         Args:
             patch: Name of the patch.
-            device_time_us: Device time in the scan's summary, µs.
+            device_time_us: Device time in the scan's summary, in µs.
 
         Raises:
             LookupError: If the fleet has no scene, the patch is unknown, or the scan was never sent or is too
@@ -316,7 +316,7 @@ class Fleet:
 
         Args:
             patch: Name of the patch.
-            t_ns: Monotonic time, ns.
+            t_ns: Monotonic time, in ns.
 
         Raises:
             LookupError: If the fleet has no scene, or the patch is unknown.
@@ -329,7 +329,7 @@ class Fleet:
         """Return the scene time (s) that corresponds to a monotonic time; None before the scene starts.
 
         Args:
-            t_ns: Monotonic time, ns.
+            t_ns: Monotonic time, in ns.
         """
         times = [patch.scene_s(t_ns) for patch in self.patches.values()]
         return max((time for time in times if time is not None), default=None)

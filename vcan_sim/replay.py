@@ -41,7 +41,7 @@ class Replayed:
     refused: int
     """Number of frames that the bus refused."""
     seconds: float
-    """Duration of the replay, s."""
+    """Duration of the replay, in s."""
 
 
 def trace_of(recording: Path) -> Path:

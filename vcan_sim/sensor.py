@@ -78,7 +78,7 @@ class SimulatedPatch:
         self.reads = 0
         """Number of readings so far, including readings for the tare."""
         self.last_read_ns = 0
-        """Time of the last reading, ns."""
+        """Time of the last reading, in ns."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
         self._random = np.random.default_rng([scene.simulation.seed, scene.number])
         self.skin: Final = PhysicalPatch(scene.layout, imperfections, scene.number)

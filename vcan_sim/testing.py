@@ -15,8 +15,8 @@ def eventually(
 
     Args:
         condition: Function without arguments that returns a true or false value.
-        within_s: Maximum wait, s.
-        every_s: Interval between calls of ``condition``, s.
+        within_s: Maximum wait, in s.
+        every_s: Interval between calls of ``condition``, in s.
         what: Description of the condition, for the error message.
 
     Raises:
@@ -35,7 +35,7 @@ def within(seconds: float) -> Iterator[None]:
     """Check a time limit at the end of a ``with`` block. The block is not interrupted.
 
     Args:
-        seconds: Maximum duration, s.
+        seconds: Maximum duration, in s.
 
     Raises:
         AssertionError: If the block takes longer than ``seconds``.

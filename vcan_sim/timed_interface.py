@@ -29,7 +29,7 @@ from vcan_sim.timed_bus import (
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
 COALESCED_NS: Final = 1_000_000
-"""Minimum interval between wake-ups of a thread that reads frames, ns."""
+"""Minimum interval between wake-ups of a thread that reads frames, in ns."""
 MOST_STATIONS: Final = 64
 """Maximum number of endpoints that can be opened on a bus. Closed endpoints count too."""
 
@@ -232,9 +232,9 @@ class TimedInterface(can.BusABC):
     Args:
         channel: Name of the bus.
         can_filters: Filters for received frames, as in python-can.
-        bitrate: Nominal bit rate, bit/s.
+        bitrate: Nominal bit rate, in bit/s.
         fd: Whether the bus carries CAN FD frames.
-        data_bitrate: Bit rate of the data phase, bit/s; default: the nominal bit rate.
+        data_bitrate: Bit rate of the data phase, in bit/s; default: the nominal bit rate.
         **options: Ignored.
 
     Raises:

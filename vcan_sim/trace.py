@@ -14,7 +14,7 @@ from vcan_sim.timed_bus import CanFrame, Delivered, Event
 from vcan_sim.timed_interface import Segment
 
 _POLL_S: Final = 0.05
-"""Maximum wait for the next frame, s."""
+"""Maximum wait for the next frame, in s."""
 
 _LAST_FRAMES: Final = 10_000
 """Maximum number of frames that a listener reads after it has been stopped."""

@@ -36,7 +36,7 @@ START_WALL_NS: Final = 1_600_000_000_000_000_000
 READINGS: Final = 10_000
 """Number of clock readings without a wait after which a thread is considered to be polling."""
 POLL_S: Final = 1e-4
-"""Time for which each clock reading suspends a polling thread, s."""
+"""Time for which each clock reading suspends a polling thread, in s."""
 
 
 class Deadlock(RuntimeError):
@@ -144,7 +144,7 @@ class VirtualClock:
         """Call a function at a given virtual time, while no thread runs.
 
         Args:
-            t_ns: Monotonic time of the call, ns. A time in the past means as soon as possible.
+            t_ns: Monotonic time of the call, in ns. A time in the past means as soon as possible.
             function: Function to call. It must not wait.
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
@@ -182,7 +182,7 @@ class VirtualClock:
 
         Args:
             waiting: Queue of the threads that wait for the same condition, longest wait first.
-            seconds: Maximum wait, s; None for no limit.
+            seconds: Maximum wait, in s; None for no limit.
 
         Returns:
             True if :meth:`wake` ended the wait, False if it timed out.

@@ -55,7 +55,7 @@ REACHABLE: Final = 3.6
 TAPS: Final = (1, 2, 3)
 """Durations of taps, in scans."""
 RAMPS_S: Final = (1.0, 3.0, 10.0, 30.0, 100.0)
-"""Times for slow presses to reach full depth, s."""
+"""Times for slow presses to reach full depth, in s."""
 HOLD_S: Final = 600.0
 SHIFT_H: Final = 4.0
 """Time between tares while false alarms are counted, h. Without tares, a steady drift of 1 % per hour would

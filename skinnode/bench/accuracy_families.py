@@ -69,7 +69,7 @@ class Sample:
     """Distance from contact to load and its standard deviation, in metres; NaN unless there is exactly one of
     each."""
     seconds: float
-    """Processor time, s."""
+    """Processor time, in s."""
 
 
 def sample(scene: Scene, field: FieldFrame, **case: Any) -> Sample:

@@ -45,7 +45,7 @@ class Phase:
     share: float
     """Depth at the end of the phase, divided by the full depth."""
     shift: float = 0.0
-    """Distance from the first position at the end of the phase, pitches."""
+    """Distance from the first position at the end of the phase, in pitches."""
     slowing: bool = False
     """Whether the motion slows down exponentially, as in creep; otherwise, its speed is constant."""
 

@@ -14,7 +14,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.detect.touch_detector import TouchDetector
 
 PERIOD_S: Final = 0.08
-"""Default scan period, s."""
+"""Default scan period, in s."""
 FALSE_ALARMS_PER_HOUR: Final = 0.1
 DRIFT: Final = 0.01
 BLOCK: Final = 500

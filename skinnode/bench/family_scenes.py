@@ -29,11 +29,11 @@ BONDED: Final = ("sphere", "punch", "ridge", "edge", "two")
 THICKNESSES: Final = (1.0, 2.0, 4.0)
 """Thicknesses of the bonded layers, in heights of the upper layer."""
 APART: Final = (3.0, 6.0)
-"""Minimum and maximum distance between two presses, pitches."""
+"""Minimum and maximum distance between two presses, in pitches."""
 FINE: Final = 3
 """Number of simulator cells per pitch."""
 MARGIN: Final = 3
-"""Width of the simulated skin beyond the outermost electrodes, pitches."""
+"""Width of the simulated skin beyond the outermost electrodes, in pitches."""
 CLOSE: Final = 1e-4
 """Maximum gap or overlap in a simulated contact, relative to the depth."""
 
@@ -45,7 +45,7 @@ class Scene:
     truth_m: Float
     """(U, N, 3), m: displacement."""
     centers_m: tuple[tuple[float, float], ...]
-    """Centre of each load, m."""
+    """Centre of each load, in m."""
     force_n: Float
     """(3,), N: total force; NaN if unknown."""
     bonded: bool

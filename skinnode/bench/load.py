@@ -36,7 +36,7 @@ from vcan_sim.default_scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Polling interval of the sender, s. On a fully loaded bus, about two frames become due in each interval.
+"""Polling interval of the sender, in s. On a fully loaded bus, about two frames become due in each interval.
 Frames that are due together are sent together, as a USB adapter does."""
 LEAD_S: Final = 0.5
 """Delay between the call to :meth:`Generator.begin` and the first SYNC, s."""
@@ -56,7 +56,7 @@ class Sent:
     bus_load: dict[str, float]
     """Fraction of the time during which each simulated bus was busy."""
     late_p99_ms: float
-    """99th percentile of the delay from the simulated to the actual send time, ms."""
+    """99th percentile of the delay from the simulated to the actual send time, in ms."""
     late_max_ms: float
     cpu_s: float
 
@@ -66,7 +66,7 @@ class Generator:
 
     Args:
         hand: Hand to replay.
-        seconds: Duration of the traffic, s.
+        seconds: Duration of the traffic, in s.
         touched: If True, all patches are pressed and stroked as in the demo; if False, none is touched.
         core: Processor core to which the process is bound; None for no binding.
     """

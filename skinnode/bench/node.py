@@ -27,7 +27,7 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Rate at which frames with eight data bytes fully load a 1 Mbit/s bus, Hz."""
+"""Rate at which frames with eight data bytes fully load a 1 Mbit/s bus, in Hz."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
 _BURST_S: Final = 1e-3  # time between bursts, because a thread cannot wake up 8000 times per second

@@ -36,7 +36,7 @@ CLASSIC_MS: Final = 50
 """SYNC period with classic CAN, ms. Four patches send 101 frames each per period, 8,080 frames/s in all."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset between the SYNCs of successive buses in staggered scenes, ms. The offset lets the host solve the
+"""Offset between the SYNCs of successive buses in staggered scenes, in ms. The offset lets the host solve the
 four patches of one bus before the scans of the next bus are complete."""
 SCENES: Final = (
     (False, True, 0.0),
@@ -126,7 +126,7 @@ def full_hand(  # noqa: PLR0913 - the properties in which hands differ
     Args:
         buses: Number of buses.
         fd: Whether the patches send CAN FD frames.
-        stagger_ms: Offset between the SYNCs of successive buses, ms.
+        stagger_ms: Offset between the SYNCs of successive buses, in ms.
         interface: ``udp`` or ``socketcan``.
         channel: Channel of the ``socketcan`` interface.
         folder: Folder for the baseline file.

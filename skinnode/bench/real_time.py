@@ -29,7 +29,7 @@ HOP_LIMITS: Final = (1, 0)
 """Values of python-can's ``hop_limit`` option. With 1, the default, each frame is also sent to the network;
 with 0, frames stay on this machine."""
 _SETTLED_S: Final = 3.0
-"""Time between bring-up and measurement, s."""
+"""Time between bring-up and measurement, in s."""
 _BURST: Final = 16
 """Number of frames sent at a time while frame exchange is timed."""
 
@@ -49,7 +49,7 @@ def run(seconds: float) -> dict[str, Any]:
     """Measure the simulator with each hop limit, and the time to exchange a frame.
 
     Args:
-        seconds: Duration of each measurement, s.
+        seconds: Duration of each measurement, in s.
 
     Returns:
         ``rows``: results of :func:`measure`; ``frame_us``: result of :func:`frame_us`.
@@ -67,7 +67,7 @@ def measure(patches: int, touched: int, hop_limit: int, seconds: float) -> Row:
         patches: Number of patches.
         touched: Number of touched patches.
         hop_limit: ``hop_limit`` option of all buses.
-        seconds: Duration of the measurement, s.
+        seconds: Duration of the measurement, in s.
 
     Returns:
         The arguments; the two processes' CPU times divided by the duration (``simulator``, ``host``); the

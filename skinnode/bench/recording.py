@@ -59,7 +59,7 @@ def run(
     Args:
         buses: Number of fully loaded buses with four patches each.
         minutes: Duration of each recording, min.
-        seconds: Duration of the block of simulated traffic, s.
+        seconds: Duration of the block of simulated traffic, in s.
         report: Function that receives each format's results as soon as they are complete.
 
     Returns:

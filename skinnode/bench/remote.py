@@ -36,7 +36,7 @@ from skinnode.transport.datagram import DatagramPort
 
 BUSES: Final = 4
 ROUND_S: Final = 60.0
-"""Duration of a round, s; the replayed frames of a round are held in memory."""
+"""Duration of a round, in s; the replayed frames of a round are held in memory."""
 TIMES_A_PING: Final = 3.0
 """Maximum ratio of the fields' p99 latency to the pings' p99 latency."""
 PORT: Final = 17647
@@ -51,7 +51,7 @@ def run(seconds: float, *, publish_only: bool, report: Callable[[Row], None]) ->
     """Measure latencies in rounds of up to one minute.
 
     Args:
-        seconds: Total duration, s.
+        seconds: Total duration, in s.
         publish_only: Whether to measure the host without a second process and without pings.
         report: Function called with the figures of each round.
 

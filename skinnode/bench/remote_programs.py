@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import zenoh
 
 PING_S: Final = 0.01
-"""Interval between pings, s."""
+"""Interval between pings, in s."""
 _LONGEST_S: Final = 10.0
-"""Time after which a ping without an echo ends the benchmark, s."""
+"""Time after which a ping without an echo ends the benchmark, in s."""
 _PING, _PONG = "skinnode-bench/ping", "skinnode-bench/pong"
 
 

@@ -49,10 +49,10 @@ RESIDENT_MB: Final = 8.0
 """Maximum increase in resident memory, MB. The C allocator does not return all freed memory at once, so small
 increases are normal."""
 BACK_S: Final = 15.0
-"""Time limit for the recovery of all patches after a round, s. Recovery normally takes less than a second,
+"""Time limit for the recovery of all patches after a round, in s. Recovery normally takes less than a second,
 but can take longer on a loaded machine."""
 SLOW_S: Final = 1.0
-"""Recovery time above which a round is reported as slow, s."""
+"""Recovery time above which a round is reported as slow, in s."""
 STARVED: Final = 0.1
 """Fraction of the rounds in which child processes keep all processors busy."""
 STARVED_S: Final = 3.0

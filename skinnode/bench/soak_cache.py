@@ -15,7 +15,7 @@ _DAMAGED: Final = 4
 """Number of cache files to damage. The number is small, because recompiling a kernel can take a few
 seconds."""
 _COMPILE_S: Final = 600.0
-"""Time limit for compiling all kernels on a slow machine, s."""
+"""Time limit for compiling all kernels on a slow machine, in s."""
 
 
 def fill(folder: Path) -> None:

@@ -14,7 +14,7 @@ _NICE: Final = -5
 nice value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
-"""Maximum lifetime of a child process, s. A child also exits when its parent has exited."""
+"""Maximum lifetime of a child process, in s. A child also exits when its parent has exited."""
 
 _BUSY: Final = """
 import os, sys, time

@@ -29,7 +29,7 @@ LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
 NOISES: Final = (1e-5, 1e-4, 1e-3)
 SCALE: Final = CodeScale(16)
 RATE_HZ: Final = 100.0
-"""Scan rate used to convert numbers of scans to hours, Hz."""
+"""Scan rate used to convert numbers of scans to hours, in Hz."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Setting:
 
     preset: str
     height: float
-    """Height of the upper layer above the lower layer, pitches."""
+    """Height of the upper layer above the lower layer, in pitches."""
     noise: float
 
     @property

@@ -24,7 +24,7 @@ from skinnode.protocol.summary import SummaryFlag
 
 CONVERSIONS: Final = int(SummaryFlag.CONVERSIONS)
 PERIOD_NS: Final = 10_000_000
-"""Time between consecutive scans, ns."""
+"""Time between consecutive scans, in ns."""
 
 
 @dataclass

@@ -38,11 +38,11 @@ class Load(Protocol):
 
     @property
     def center_m(self) -> tuple[float, float]:
-        """Initial centre (x, y) of the load, metres."""
+        """Initial centre (x, y) of the load, in metres."""
 
     @property
     def depth_m(self) -> float:
-        """Full depth, metres."""
+        """Full depth, in metres."""
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
         """Return the (P, 3) displacements of the (P, 2) surface points, in metres."""
@@ -93,7 +93,7 @@ class Skin:
     Args:
         layout: Nominal layout, which is passed to the solver.
         height: True height of the upper layer divided by the nominal height.
-        electrode: Radius of the electrodes, pitches; 0 for point electrodes, as in the solver's model.
+        electrode: Radius of the electrodes, in pitches; 0 for point electrodes, as in the solver's model.
         strain: Coefficient β of the strain-dependent resistance ρ d (1 + β (d/d₀ − 1)), where d₀ is the
             distance d at rest.
         series: Contact resistance in series with each crossing, as a fraction of the crossing's R₀.
@@ -331,9 +331,9 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
         rng: Random generator.
         layout: Patch to press.
         depth: Depth divided by the layer height.
-        radius: Minimum and maximum radius of the sphere, pitches.
+        radius: Minimum and maximum radius of the sphere, in pitches.
         shear: Maximum coefficient of friction.
-        margin: Minimum distance from the centre to the border of the patch, pitches.
+        margin: Minimum distance from the centre to the border of the patch, in pitches.
         where: ``inside``, ``edge`` or ``half off``. For ``edge``, the centre is on the patch's border in x;
             for ``half off``, it is half a contact radius outside this border.
     """

@@ -48,19 +48,19 @@ class PlannedFrame:
     name: str
     can_id: int
     length: int
-    """Data length, bytes."""
+    """Data length, in bytes."""
     period_s: float
-    """Period at which the frames are sent, s."""
+    """Period at which the frames are sent, in s."""
     count: int
     """Number of frames with this identifier per period."""
     spacing_s: float
-    """Minimum time between consecutive frames with this identifier within a period, s."""
+    """Minimum time between consecutive frames with this identifier within a period, in s."""
     jitter_s: float
-    """Maximum deviation of a frame from its scheduled time, s."""
+    """Maximum deviation of a frame from its scheduled time, in s."""
     worst_s: float
     """Duration of a frame with the maximum number of stuff bits, s."""
     typical_s: float
-    """Mean duration of a frame with random data, s."""
+    """Mean duration of a frame with random data, in s."""
     scans: bool = False
     """Whether the frames are sent in every SYNC period."""
     response_s: float | None = None
@@ -101,7 +101,7 @@ class BusPlan:
 
     bus: BusConfig
     period_s: float
-    """SYNC period, s."""
+    """SYNC period, in s."""
     frames: tuple[PlannedFrame, ...]
     scans: tuple[ScanTime, ...]
 
@@ -206,7 +206,7 @@ def inhibit_time_100us(period_ms: int, frames: int) -> int:
     """Return the inhibit time (0x1800:3, unit 100 µs) that makes a scan last SCAN_SHARE of the SYNC period.
 
     Args:
-        period_ms: SYNC period, ms.
+        period_ms: SYNC period, in ms.
         frames: number of frames in a scan.
     """
     return int(period_ms * 10 * SCAN_SHARE / frames)

@@ -30,15 +30,15 @@ class Message:
     can_id: int
     """Identifier, unique on the bus; a lower identifier has a higher priority."""
     time_ns: int
-    """Maximum duration of a frame, including the inter-frame space, ns."""
+    """Maximum duration of a frame, including the inter-frame space, in ns."""
     period_ns: int
-    """Minimum time between the starts of consecutive bursts, ns."""
+    """Minimum time between the starts of consecutive bursts, in ns."""
     count: int = 1
     """Number of frames per burst."""
     spacing_ns: int = 0
-    """Minimum time between consecutive frames of a burst, ns."""
+    """Minimum time between consecutive frames of a burst, in ns."""
     jitter_ns: int = 0
-    """Maximum queueing jitter of a frame, ns. The jitter does not change the order of the frames."""
+    """Maximum queueing jitter of a frame, in ns. The jitter does not change the order of the frames."""
 
     def __post_init__(self) -> None:
         for name, least in (

@@ -98,9 +98,9 @@ def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stri
 
     Args:
         ids: (n,) identifiers.
-        lengths: (n,) data lengths, bytes.
+        lengths: (n,) data lengths, in bytes.
         payload: the data of all frames, concatenated.
-        stride: distance between the data of consecutive frames in ``payload``, bytes; 0 if the data are
+        stride: distance between the data of consecutive frames in ``payload``, in bytes; 0 if the data are
             contiguous.
         bits: (n,) output, number of bits in each frame.
 
@@ -115,7 +115,7 @@ def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: 
 
     Args:
         ids: (n,) identifiers.
-        lengths: (n,) valid CAN FD data lengths, bytes.
+        lengths: (n,) valid CAN FD data lengths, in bytes.
         payload: the data of all frames, concatenated.
         nominal: (n,) output, bits at the nominal bit rate.
         fast: (n,) output, bits at the data bit rate.

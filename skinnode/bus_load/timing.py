@@ -243,7 +243,7 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
     Args:
         can_id: (n,) identifiers of 11 bits.
-        dlc: (n,) data lengths, bytes.
+        dlc: (n,) data lengths, in bytes.
         data: (n, 8) bytes; bytes beyond the length are ignored.
 
     Returns:
@@ -275,7 +275,7 @@ class BusLoad:
     thread-safe.
 
     Args:
-        bitrate_bps: nominal bit rate, bit/s.
+        bitrate_bps: nominal bit rate, in bit/s.
         data_bitrate_bps: data bit rate of CAN FD, bit/s; by default the nominal bit rate.
 
     Raises:
@@ -343,7 +343,7 @@ class BusLoad:
         """Return the duration of all counted frames divided by ``time_s``; the ratio can exceed 1.
 
         Args:
-            time_s: length of the interval, s.
+            time_s: length of the interval, in s.
         """
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 

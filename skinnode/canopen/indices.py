@@ -90,7 +90,7 @@ def predefined_cob_ids(node_id: int) -> frozenset[int]:
 
 
 BIT_RATES_BPS: Final = (125_000, 250_000, 500_000, 1_000_000)
-"""Bit rates supported by a patch, bit/s."""
+"""Bit rates supported by a patch, in bit/s."""
 
 # --- communication objects (CiA 301)
 DEVICE_TYPE: Final = 0x1000

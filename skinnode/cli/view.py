@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from skinnode.view.viewer_process import ViewerProcess
 
 _LOOK_S = 0.1
-"""Interval at which the viewer is checked, s."""
+"""Interval at which the viewer is checked, in s."""
 _PORTS = 65_534
 
 

@@ -107,12 +107,12 @@ class SyncConfig(Table):
 
     @property
     def stagger_s(self) -> float:
-        """Delay between the SYNCs on successive buses, s."""
+        """Delay between the SYNCs on successive buses, in s."""
         return self.stagger_ms * 1e-3
 
     @property
     def period_s(self) -> float:
-        """SYNC period, s."""
+        """SYNC period, in s."""
         return self.period_ms * 1e-3
 
 
@@ -129,5 +129,5 @@ class BringUpConfig(Table):
 
     @property
     def heartbeat_s(self) -> float:
-        """Heartbeat period of the nodes, s."""
+        """Heartbeat period of the nodes, in s."""
         return self.heartbeat_ms * 1e-3

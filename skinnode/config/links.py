@@ -27,7 +27,7 @@ class PoseConfig(Table):
     position_m: Annotated[
         tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
     ] = (0.0, 0.0, 0.0)
-    """Origin of the frame in its parent frame, metres."""
+    """Origin of the frame in its parent frame, in metres."""
     quaternion_xyzw: Annotated[
         tuple[_Part, _Part, _Part, _Part] | None,
         Field(strict=False),

@@ -97,13 +97,13 @@ class LayoutConfig(Table):
     preset: Annotated[Preset, one_of(Preset)] = "staggered"
     """Named arrangement of the electrodes."""
     pitch_m: Length = 4e-3
-    """Distance between neighbouring electrodes of an upper wire, metres."""
+    """Distance between neighbouring electrodes of an upper wire, in metres."""
     height_m: Length = 2e-3
-    """Height of the upper electrodes above the lower electrodes, metres."""
+    """Height of the upper electrodes above the lower electrodes, in metres."""
     upper_wires: Count = 10
     """Number of upper wires, U; each upper wire is one row of the resistance matrix."""
     upper_electrodes: Count = 10
-    """Number of electrodes per upper wire, N."""
+    """Number of electrodes per upper wire, in N."""
     lower_wires: Count | None = None
     """Number of lower wires, K; each lower wire is one column of the resistance matrix. If
     None, K is 3 N."""

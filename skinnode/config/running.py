@@ -46,7 +46,7 @@ class SolverConfig(Table):
         Field(gt=0, le=1, allow_inf_nan=False),
         Allowed("a number greater than 0 and at most 1 (m)"),
     ] = None
-    """Maximum standard deviation of the displacements in a precise field, metres. If None, the limit is
+    """Maximum standard deviation of the displacements in a precise field, in metres. If None, the limit is
     derived from the layout and the noise."""
     max_force_std_n: Annotated[
         float | None,

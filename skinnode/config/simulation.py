@@ -25,7 +25,7 @@ class SimulationConfig(Table):
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
     """Random seed for the converter noise and the indenter positions."""
     indenter_radius_m: Length = 0.04
-    """Radius of the spherical indenter, metres."""
+    """Radius of the spherical indenter, in metres."""
     depth: Ratio = 0.1
     """Maximum indentation, as a fraction of the height of the upper electrodes. If 0, nothing touches the
     hand."""
@@ -36,6 +36,6 @@ class SimulationConfig(Table):
     slide_speed_m_per_s: _Speed = 0.008
     """Sliding speed of the indenter, metres per second."""
     cycle_s: _Cycle = 4.0
-    """Duration of one cycle (pressing, sliding and lifting off), seconds."""
+    """Duration of one cycle (pressing, sliding and lifting off), in seconds."""
     converter_noise: Ratio = 3e-6
     """Standard deviation of the simulated converter's noise, relative to the resistance."""

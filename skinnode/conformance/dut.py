@@ -20,7 +20,7 @@ STATES: Final = {0: "initialising", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OP
 _HEARTBEATS: Final = tuple(bytes((state,)) for state in STATES if state)
 
 BOOT_S: Final = 5.0
-"""Maximum boot time of a device, s."""
+"""Maximum boot time of a device, in s."""
 
 _ASK_EACH_S: Final = 0.25
 

@@ -25,7 +25,7 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
 
     Args:
         frames: At least two frames.
-        period_ms: Expected period, ms.
+        period_ms: Expected period, in ms.
         what: Description of the frames, for the message.
         or_sooner: Whether shorter intervals are allowed, because events trigger additional frames.
     """

@@ -14,14 +14,14 @@ from skinnode.process import clock
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""Maximum wait for a response, s.
+"""Maximum wait for a response, in s.
 
 Devices respond much faster. The limit is generous, so that a delay on the tester's machine does not cause a
 failure.
 """
 
 QUIET_S: Final = 0.06
-"""Time to listen for a frame that must not be sent, s."""
+"""Time to listen for a frame that must not be sent, in s."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
@@ -39,7 +39,7 @@ class TraceLine(NamedTuple):
     """Frame sent or received during a case."""
 
     t_s: float
-    """Time since the start of the case, s."""
+    """Time since the start of the case, in s."""
     sent: bool
     """Whether the tester sent the frame."""
     can_id: int
@@ -103,7 +103,7 @@ class Tester:
 
         Args:
             can_id: CAN-ID of the frame.
-            within_s: Maximum wait, s.
+            within_s: Maximum wait, in s.
             match: Further condition that the frame must meet.
 
         Returns:

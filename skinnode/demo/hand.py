@@ -23,7 +23,7 @@ _PLACES: Final = {
 The poses are invented; the palm faces along the z axis, and the fingers point along the y axis.
 """
 _MORE_MM: Final = 50.0
-"""Spacing of the patches without a predefined name, which lie in rows below the wrist, mm."""
+"""Spacing of the patches without a predefined name, which lie in rows below the wrist, in mm."""
 _SYNC_MS_PER_PATCH: Final = 20
 """SYNC period per patch, ms. A scan consists of 101 frames of up to 135 bits, so the bus load is at most 68 %
 at 1 Mbit/s."""

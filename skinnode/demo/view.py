@@ -119,7 +119,7 @@ def render(
     Args:
         patches: Data of each patch.
         bus: Data of the bus and of the run.
-        full_scale_m: Depth drawn at full brightness, metres.
+        full_scale_m: Depth drawn at full brightness, in metres.
         room: Maximum number of patches to draw.
     """
     line = Text.assemble(

@@ -19,10 +19,10 @@ from skinnode.host.sdo_client import RemoteOd
 from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum wait for a heartbeat, s. Heartbeats with a longer period are missed."""
+"""Maximum wait for a heartbeat, in s. Heartbeats with a longer period are missed."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum waits for the responses to the first and the second remote frame, s.
+"""Maximum waits for the responses to the first and the second remote frame, in s.
 
 The second remote frame is sent in case the node was too busy to answer the first.
 """
@@ -92,7 +92,7 @@ class BusConnection(Closing):
 
         Args:
             condition: Polled until it returns a true value.
-            within_s: Maximum wait, s.
+            within_s: Maximum wait, in s.
 
         Returns:
             True if the condition became true, False after ``within_s``.

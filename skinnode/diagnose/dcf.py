@@ -54,7 +54,7 @@ def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_
         sheet: EDS of the device.
         readings: Values read from the node.
         node_id: Node-ID of the node.
-        bitrate_bps: Bit rate of the bus, bit/s.
+        bitrate_bps: Bit rate of the bus, in bit/s.
         name: Name of the node.
     """
     parser = _parser(sheet.text)

@@ -22,16 +22,16 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests in a sweep, s. At 1 Mbit/s, the requests cause a bus load of one sixth."""
+"""Interval between requests in a sweep, in s. At 1 Mbit/s, the requests cause a bus load of one sixth."""
 
 ANSWER_S: Final = 0.12
-"""Time to wait for responses after the last request in a sweep, s."""
+"""Time to wait for responses after the last request in a sweep, in s."""
 
 SWEEPS: Final = 2
 """Number of sweeps over all node-IDs. The second sweep reaches nodes that were busy during the first."""
 
 LISTEN_S: Final = 1.2
-"""Minimum listening time, s. A stopped node does not answer SDO requests and is found only by its
+"""Minimum listening time, in s. A stopped node does not answer SDO requests and is found only by its
 heartbeats."""
 
 LSS_S: Final = 1.5
@@ -39,7 +39,7 @@ LSS_S: Final = 1.5
 remain unidentified."""
 
 OTHERS_S: Final = 1.0
-"""Maximum wait for the SDO transfers of other clients to end, s."""
+"""Maximum wait for the SDO transfers of other clients to end, in s."""
 
 _QUIET_S: Final = 0.1
 _THREADS: Final = 16

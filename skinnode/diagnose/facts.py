@@ -55,11 +55,11 @@ class ScanFacts:
     n_over: Counts
     """(U, K) number of scans in which each crossing was open, shorted or out of range, respectively."""
     t_s: Float
-    """(T,) reception time of the last frame of each scan, relative to the first scan, s."""
+    """(T,) reception time of the last frame of each scan, relative to the first scan, in s."""
     latency_s: Float
-    """(T,) time from SYNC to the last frame of the scan, s; NaN if the SYNC was not received."""
+    """(T,) time from SYNC to the last frame of the scan, in s; NaN if the SYNC was not received."""
     device_us: Counts
-    """(T,) time of the scan on the node's clock, µs; -1 if the summary was lost."""
+    """(T,) time of the scan on the node's clock, in µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
     """(T,) mask of the complete scans."""
     step: float
@@ -117,7 +117,7 @@ class BusFacts:
     """State of the CAN controller reported by the kernel, such as ``ERROR-ACTIVE``."""
     link_bitrate_bps: int | None = None
     seconds: float = 0.0
-    """Listening time, s."""
+    """Listening time, in s."""
     frames: int = 0
     load: float = 0.0
     """Bus load (fraction) in the busiest second of the capture, or in the last second if nothing was
@@ -131,14 +131,14 @@ class BusFacts:
     strangers: tuple[FoundNode, ...] = ()
     """Nodes that are not in the hand file."""
     period_s: float | None = None
-    """SYNC period from the hand file, s."""
+    """SYNC period from the hand file, in s."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
-    """Reception times of the SYNCs, s; empty if the doctor sent SYNC."""
+    """Reception times of the SYNCs, in s; empty if the doctor sent SYNC."""
     sync_counters: tuple[int, ...] = ()
     """Counters of the SYNCs received; 0 for a SYNC without a counter."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """SYNC period of the doctor, s; 0 if it sent no SYNC. The period is longer than ``period_s`` if a node
+    """SYNC period of the doctor, in s; 0 if it sent no SYNC. The period is longer than ``period_s`` if a node
     that no host has configured needs more time for a scan."""
     active: bool = False
     """Whether the doctor was allowed to start nodes that were not running."""
@@ -149,9 +149,9 @@ class BusFacts:
     master_node_id: int | None = None
     """Node-ID of the host's own heartbeat, from the hand file; None if the host sends none."""
     master_beats_s: Float | None = None
-    """Reception times of the host's heartbeat, s."""
+    """Reception times of the host's heartbeat, in s."""
     heartbeat_ms: int | None = None
-    """Heartbeat period from the hand file, ms."""
+    """Heartbeat period from the hand file, in ms."""
     patches: tuple[PatchFacts, ...] = ()
 
     @property

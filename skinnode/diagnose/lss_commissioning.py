@@ -63,7 +63,7 @@ class Commissioning:
     node_id: int | None
     """New node-ID; None to keep the current one."""
     bitrate_bps: int | None
-    """New bit rate, bit/s; None to keep the current one."""
+    """New bit rate, in bit/s; None to keep the current one."""
     store: bool
     """Whether to store the settings in non-volatile memory."""
 

@@ -16,7 +16,7 @@ FOLLOW_S: Final = 1.5
 """Maximum time for a node to report its new state, s, in addition to two heartbeat periods."""
 
 BOOT_S: Final = 5.0
-"""Maximum boot time of a node, s."""
+"""Maximum boot time of a node, in s."""
 
 _GUARD_EACH_S: Final = 0.1
 

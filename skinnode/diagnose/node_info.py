@@ -47,7 +47,7 @@ class PatchInfo:
     send_threshold_codes: int
     send_refresh_scans: int
     period_ms: int
-    """Period of the node's own scan timer, ms; 0 if the node scans at SYNC."""
+    """Period of the node's own scan timer, in ms; 0 if the node scans at SYNC."""
     averaging: int
     open_upper: tuple[int, ...]
     shorted_upper: tuple[int, ...]

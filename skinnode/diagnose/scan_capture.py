@@ -21,7 +21,7 @@ from skinnode.transport import Frame
 _MOST_SCANS: Final = 1000
 _MOST_SYNCS: Final = 100_000
 _LONGEST_NS: Final = 10_000_000_000
-"""Maximum time from a SYNC to the first frame of its scan, ns."""
+"""Maximum time from a SYNC to the first frame of its scan, in ns."""
 
 
 class ScanCapture:
@@ -44,7 +44,7 @@ class ScanCapture:
             node_id: The node.
             profile: Number of wires and other dimensions of the patch.
             overflow: Overflow value of the SYNC counter; 0 if SYNC has no counter.
-            period_s: SYNC period, s.
+            period_s: SYNC period, in s.
         """
         assembler = ScanAssembler(
             profile, counter_overflow=overflow, period_ns=round(period_s * 1e9), node_id=node_id

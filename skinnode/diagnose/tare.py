@@ -27,14 +27,14 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Time without SDO frames after which an SDO channel is considered idle, s."""
+"""Time without SDO frames after which an SDO channel is considered idle, in s."""
 
 HOST_BEGINS_S: Final = 1.0
 """Maximum time in seconds, in addition to one SYNC period, from the tare to a running host's first SDO
 request. A host on an idle machine needs 0.3 s."""
 
 OTHERS_S: Final = 4.0
-"""Maximum wait for the SDO transfers of other clients to end, s."""
+"""Maximum wait for the SDO transfers of other clients to end, in s."""
 
 _ATTEMPTS: Final = 3
 _POLL_S: Final = 0.02
@@ -86,7 +86,7 @@ def tare(
         connection: The bus.
         node_id: The node.
         patch: Name of the patch; empty if there is no hand file.
-        sync_period_s: SYNC period of the hand, s.
+        sync_period_s: SYNC period of the hand, in s.
         progress: Called with a description of each step.
 
     Returns:

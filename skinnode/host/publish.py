@@ -32,7 +32,7 @@ def check_capacity(capacity: int) -> None:
     """Check a queue's capacity.
 
     Raises:
-        ValueError: if the capacity is not an integer of at least 1.
+        ValueError: if the capacity is not a positive integer.
     """
     if not isinstance(capacity, int) or capacity < 1:
         raise ValueError(f"capacity: got {capacity!r}, must be an integer of at least 1")

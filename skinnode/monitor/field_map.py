@@ -85,7 +85,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
     Args:
         field: Newest field of the patch.
-        upper_m: (U, N, 3) positions of the electrodes at rest, m.
+        upper_m: (U, N, 3) positions of the electrodes at rest, in m.
     """
     moved = np.moveaxis(field.displacement_m, -1, 0)
     std_m = field.displacement_std_m

@@ -50,7 +50,7 @@ class FaultBook:
 
         Args:
             view: Current view of the hand.
-            real_ns: Monotonic time of the monitor, ns.
+            real_ns: Monotonic time of the monitor, in ns.
             ending: Whether the session is ending; a patch that has never been operational then counts as a
                 fault.
         """

@@ -46,7 +46,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
     Args:
         field: Newest field of the patch.
-        rest_m: (U, N, 3) positions of the electrodes at rest, m.
+        rest_m: (U, N, 3) positions of the electrodes at rest, in m.
     """
     if field.contacts or field.method == "posterior":
         return tuple(

@@ -113,7 +113,7 @@ class CanopenDevice:
         """Start the application and boot. A device without a node-ID first waits until LSS assigns one.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         self._now_ns = t_ns
         self._storage.load()
@@ -136,7 +136,7 @@ class CanopenDevice:
         Args:
             can_id: Identifier of the frame.
             data: Payload of the frame; ignored for a remote frame.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
             remote: Whether the frame is a remote frame.
         """
         if self._bit_rate_change.silent(t_ns):
@@ -162,7 +162,7 @@ class CanopenDevice:
 
         Args:
             state: New state of the CAN controller.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         was, self._bus_state = self._bus_state, state
         if self.nmt_state is NmtState.INITIALISING or state is was:
@@ -205,7 +205,7 @@ class CanopenDevice:
         """Perform all actions that are due at ``t_ns``. Calls before the next deadline have no effect.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:
             return

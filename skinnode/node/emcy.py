@@ -59,7 +59,7 @@ class EmcyProducer:
         Args:
             code: Error code.
             detail: Up to five manufacturer-specific bytes.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         self._send_error(code, self.register | code.register_bit | 1, detail, t_ns)
         self._send_end(code, t_ns)
@@ -70,7 +70,7 @@ class EmcyProducer:
         Args:
             code: Error code.
             detail: Up to five manufacturer-specific bytes.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
             who: Number that distinguishes independent errors with the same code.
         """
         if self._present.get((code, who)) != detail:
@@ -82,7 +82,7 @@ class EmcyProducer:
 
         Args:
             code: Error code.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
             who: As in :meth:`report`.
         """
         if self._present.pop((code, who), None) is not None:

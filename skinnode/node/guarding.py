@@ -39,7 +39,7 @@ class Guarding:
 
         Args:
             state: NMT state of the node.
-            t_ns: Arrival time of the request, ns.
+            t_ns: Arrival time of the request, in ns.
         """
         answer = bytes((state | self._toggle,))
         self._toggle ^= GUARD_TOGGLE

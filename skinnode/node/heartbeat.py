@@ -32,8 +32,8 @@ class HeartbeatProducer:
         """Start the schedule. The first heartbeat is due one period after the boot-up message.
 
         Args:
-            period_ms: Heartbeat period, ms; 0 for no heartbeats.
-            t_ns: Time of the boot-up message, ns.
+            period_ms: Heartbeat period, in ms; 0 for no heartbeats.
+            t_ns: Time of the boot-up message, in ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
@@ -42,8 +42,8 @@ class HeartbeatProducer:
         """Change the heartbeat period. A heartbeat is due immediately.
 
         Args:
-            period_ms: Heartbeat period, ms; 0 for no heartbeats.
-            t_ns: Current time, ns.
+            period_ms: Heartbeat period, in ms; 0 for no heartbeats.
+            t_ns: Current time, in ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
@@ -116,7 +116,7 @@ class HeartbeatConsumer:
         Args:
             node_id: Node-ID of the monitored node.
             state: NMT state in the message.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
         """
         item = self._monitored[node_id]
         if state == NmtState.INITIALISING:

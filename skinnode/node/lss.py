@@ -50,7 +50,7 @@ class LssSlave:
     Args:
         address: LSS address, from the identity object (0x1018).
         node_id: Persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
-        bit_rates_bps: Supported bit rates, bit/s; empty if the bit rate cannot be changed.
+        bit_rates_bps: Supported bit rates, in bit/s; empty if the bit rate cannot be changed.
         bit_rate_bps: Stored bit rate, bit/s, or None.
         store: Function that stores the pending node-ID and bit rate (bit/s or None), or raises OSError; None
             if the node has no memory.
@@ -235,9 +235,9 @@ class BitRateChange:
         """Start a bit rate change.
 
         Args:
-            bit_rate_bps: New bit rate, bit/s; None to keep the current bit rate.
-            delay_ms: Delay in the request, ms.
-            t_ns: Arrival time of the request, ns.
+            bit_rate_bps: New bit rate, in bit/s; None to keep the current bit rate.
+            delay_ms: Delay in the request, in ms.
+            t_ns: Arrival time of the request, in ns.
         """
         self._bit_rate_bps = bit_rate_bps
         self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000

@@ -129,7 +129,7 @@ class ObjectStore:
 
         Args:
             index: Index of the object.
-            length: Length of the value, bytes.
+            length: Length of the value, in bytes.
             reader: Returns the value.
             writer: Stores the value.
         """

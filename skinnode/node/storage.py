@@ -154,7 +154,7 @@ class Storage:
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
-            bit_rate_bps: Bit rate, bit/s; None if LSS has not configured one.
+            bit_rate_bps: Bit rate, in bit/s; None if LSS has not configured one.
 
         Raises:
             OSError: If saving fails.

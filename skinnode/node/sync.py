@@ -55,7 +55,7 @@ class SyncWindow:
 
         Args:
             number: Number of the TPDO, counted from 0.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         if self.is_open(t_ns):
             self._clear(number, t_ns)
@@ -154,7 +154,7 @@ class Sync:
 
         Args:
             message: Payload of the SYNC.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
         """
         counted = self._overflow > 0
         if len(message) == counted:

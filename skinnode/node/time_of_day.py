@@ -53,7 +53,7 @@ class TimeConsumer:
 
         Args:
             data: Payload of the frame.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
 
         Returns:
             Whether the payload is a valid time of day. An invalid payload is ignored.

@@ -28,7 +28,7 @@ class Timers:
 
         Args:
             key: Number of the timer.
-            t_ns: Time at which the timer is due, ns; NO_DEADLINE_NS to cancel it.
+            t_ns: Time at which the timer is due, in ns; NO_DEADLINE_NS to cancel it.
         """
         if t_ns == NO_DEADLINE_NS:
             self._due.pop(key, None)

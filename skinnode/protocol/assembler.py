@@ -67,10 +67,10 @@ class ScanAssembler:
     the frame returns the first scan and ``poll`` returns the second.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         counter_overflow: Synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
             the patch counts its own scans from 0 to 255.
-        period_ns: Scan period, ns. The timeout is a multiple of this period.
+        period_ns: Scan period, in ns. The timeout is a multiple of this period.
         grace_ns: Maximum time (ns) to wait for the remaining frames once the summary or all chunks of a full
             scan have arrived.
         node_id: Node-ID for the COB-IDs in the errors passed to ``on_reject``.
@@ -145,7 +145,7 @@ class ScanAssembler:
 
         Args:
             data: Payload of TPDO1. The assembler keeps a reference to this object.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
 
         Returns:
             The scan that this chunk closed, or None.
@@ -171,7 +171,7 @@ class ScanAssembler:
 
         Args:
             data: Payload of TPDO2.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
 
         Returns:
             The scan that this summary closed, or None.
@@ -208,7 +208,7 @@ class ScanAssembler:
         """If the missing frames of the open scan have timed out, close the scan and return it.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         deadline = self.next_deadline_ns()
         return self._close() if deadline is not None and t_ns >= deadline else None

@@ -71,7 +71,7 @@ def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[
     """Return the contents of the kit's files, by file name.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         layout: Electrodes of the patch; None if only the sizes are known.
     """
     folder = resources.files(__package__) / "c"
@@ -100,7 +100,7 @@ def config_header(profile: PatchProfile, layout: PatchLayout | None = None) -> s
     """Return the contents of ``skinnode_patch_config.h``, which depends only on the arguments.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         layout: Electrodes of the patch; None if only the sizes are known.
     """
     bus = "PDO over CAN FD" if profile.bus == "fd" else "classic CAN"

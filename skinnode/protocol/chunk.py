@@ -79,7 +79,7 @@ def pack_scan(
     Args:
         codes: (U, K) codes.
         scan: Scan counter, 0 to 255.
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         only: Chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
 
     Raises:
@@ -128,7 +128,7 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
     Args:
         frames: Payloads of all chunks in ascending order, concatenated.
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
     """
     return unpack_scan_with_check(frames, profile)[0]
 
@@ -138,7 +138,7 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
 
     Args:
         frames: Payloads of all chunks in ascending order, concatenated.
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
 
     Returns:
         (U, K) codes, and the CRC over them (:func:`~skinnode.protocol.scan_check.check_of_codes`).

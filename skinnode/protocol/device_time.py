@@ -21,7 +21,7 @@ def restore_time_us(low_us: int, expected_us: int) -> int:
 
     Args:
         low_us: Device time (µs) without its upper bits, from a summary with a check.
-        expected_us: Expected device time, µs.
+        expected_us: Expected device time, in µs.
     """
     return expected_us + (low_us - expected_us + TIME_WRAP_US // 2) % TIME_WRAP_US - TIME_WRAP_US // 2
 
@@ -47,7 +47,7 @@ class DeviceTimeTracker:
 
         Args:
             low_us: Device time (µs) without its upper bits, from a summary with a check.
-            t_ns: Arrival time of the summary on the host's monotonic clock, ns.
+            t_ns: Arrival time of the summary on the host's monotonic clock, in ns.
         """
         expected_us = self._time_us + (t_ns - self._t_time_ns) // 1000
         if not self._t_time_ns:

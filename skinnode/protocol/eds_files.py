@@ -26,9 +26,9 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
     """Return the contents of a patch's DCF, which depends only on the arguments.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         node_id: 1 to 127.
-        bitrate_bps: Bit rate of the bus, bit/s.
+        bitrate_bps: Bit rate of the bus, in bit/s.
 
     Raises:
         ConfigError: If the node-ID is not in the range 1 to 127, or the bit rate is not supported.
@@ -47,7 +47,7 @@ def device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
     """Return the general information in a patch's EDS or DCF.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         file_name: Name of the EDS or DCF.
     """
     variant = ", PDO over CAN FD" if profile.bus == "fd" else ""

@@ -33,7 +33,7 @@ def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:
     """Return all objects in a patch's object dictionary, in ascending order of index.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
     """
     communication = communication_objects(
         _rpdos(profile), _tpdos(profile), profile.pdo_bytes, profile.revision_number

@@ -16,7 +16,7 @@ class HeldChunks:
     """Last known payloads of all chunks of a patch.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
     """
 
     def __init__(self, profile: PatchProfile) -> None:

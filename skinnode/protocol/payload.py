@@ -16,7 +16,7 @@ def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
 
     Args:
         data: Payload of the frame.
-        length: Required length, bytes.
+        length: Required length, in bytes.
         cob_id: COB-ID for the error message.
         what: Name of the payload for the error message.
 

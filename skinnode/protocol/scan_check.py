@@ -19,7 +19,7 @@ def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
 
     Args:
         codes: (U, K) codes of all chunks, including those not sent in this scan.
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
     """
     if profile.code_bits == 16:
         return binascii.crc_hqx(codes.astype("<u2").tobytes(), CRC_INITIAL)

@@ -76,7 +76,7 @@ def row_of(field: FieldFrame, resistance: ResistanceFrame, offset_ns: int) -> Fi
     Args:
         field: The field; must have a stamp.
         resistance: Resistances from which the field was computed.
-        offset_ns: Time since 1970 minus time on the stamp's clock, ns.
+        offset_ns: Time since 1970 minus time on the stamp's clock, in ns.
     """
     stamp, shape = field.stamp, field.displacement_m.shape
     assert stamp is not None

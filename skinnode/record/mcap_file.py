@@ -99,7 +99,7 @@ class McapFile:
             bus: Name of the bus.
             frame: The frame; ``t_ns`` is a time since 1970.
             sent: Whether the host sent the frame.
-            log_ns: Time since 1970 at which the recorder received the frame, ns.
+            log_ns: Time since 1970 at which the recorder received the frame, in ns.
         """
         channel = self._frame_channels.get((bus, sent, frame.fd))
         if channel is None:
@@ -116,9 +116,9 @@ class McapFile:
 
         Args:
             field: The field; must have a stamp.
-            rest_m: (U, N, 3) electrode positions at rest, m.
-            offset_ns: Time since 1970 minus time on the stamp's clock, ns.
-            log_ns: Time since 1970 at which the recorder received the field, ns.
+            rest_m: (U, N, 3) electrode positions at rest, in m.
+            offset_ns: Time since 1970 minus time on the stamp's clock, in ns.
+            log_ns: Time since 1970 at which the recorder received the field, in ns.
         """
         stamp = field.stamp
         assert stamp is not None

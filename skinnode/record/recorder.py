@@ -36,7 +36,7 @@ from skinnode.transport.frame_log import SUFFIXES
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""Interval between flushes to the kernel, s.
+"""Interval between flushes to the kernel, in s.
 
 If this process crashes, at most the last 0.25 s of the recording are lost.
 """

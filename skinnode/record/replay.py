@@ -38,13 +38,13 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log import LoggedFrame
 
 LONGEST_SILENCE_S: Final = 60.0
-"""Maximum pause between replayed frames, s.
+"""Maximum pause between replayed frames, in s.
 
 Longer pauses are shortened, because they may be due to damaged timestamps.
 """
 
 _SLICE_S: Final = 0.1
-"""Maximum delay before :meth:`Replay.stop` takes effect, s."""
+"""Maximum delay before :meth:`Replay.stop` takes effect, in s."""
 
 
 MakeSolver = Callable[[NodeFacts, HandConfig, Callable[[], int]], ScanSolver]
@@ -283,11 +283,11 @@ class Replay:
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Difference between the time since 1970 and the recording host's monotonic clock, ns."""
+        """Difference between the time since 1970 and the recording host's monotonic clock, in ns."""
         return self._offset_ns
 
     def clock(self) -> int:
-        """Return the current replay time on the recording host's monotonic clock, ns."""
+        """Return the current replay time on the recording host's monotonic clock, in ns."""
         return self._now_ns
 
     @property

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skinnode.record.replay import Replay
 
 _ROUNDING_NS: Final = 2_000
-"""Maximum rounding error of a log's timestamps, ns."""
+"""Maximum rounding error of a log's timestamps, in ns."""
 _LAYOUTLESS: Final = (
     "the recording lacks the layout file of {patch}; solve it with skinnode resolve RECORDING --set "
     "'patches.{patch}.layout={{file=\"FILE\"}}'"

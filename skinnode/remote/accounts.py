@@ -22,9 +22,9 @@ class PatchCounts:
     published: int
     """Number of fields sent in the daemon's current run, as counted by the daemon in its newest report."""
     delay_s: float
-    """Transit time of the newest field, s; between machines, only as accurate as their clocks."""
+    """Transit time of the newest field, in s; between machines, only as accurate as their clocks."""
     age_s: float | None
-    """Time since the host received the newest field's scan, s; None before the first field."""
+    """Time since the host received the newest field's scan, in s; None before the first field."""
 
 
 class PatchAccount:
@@ -45,8 +45,8 @@ class PatchAccount:
 
         Args:
             sent: Sequence number and times of the field.
-            delay_ns: Transit time, ns.
-            t_receive_ns: Time at which the host received the scan, on this machine's monotonic clock, ns.
+            delay_ns: Transit time, in ns.
+            t_receive_ns: Time at which the host received the scan, on this machine's monotonic clock, in ns.
         """
         if sent.started_ns != self._run:
             self._run, self._sequence = sent.started_ns, sent.sequence - 1
@@ -63,7 +63,7 @@ class PatchAccount:
         """Return the counters.
 
         Args:
-            now_ns: Monotonic time, ns.
+            now_ns: Monotonic time, in ns.
         """
         age_s = None if self._t_receive_ns is None else (now_ns - self._t_receive_ns) * 1e-9
         return PatchCounts(

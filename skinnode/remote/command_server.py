@@ -28,7 +28,7 @@ _WAITING: Final = 16
 class _Arrival(NamedTuple):
     query: zenoh.Query
     t_ns: int
-    """Monotonic time at which the command arrived, ns."""
+    """Monotonic time at which the command arrived, in ns."""
 
 
 class CommandServer:

@@ -29,11 +29,11 @@ class Request:
     patch: str
     """Name of the patch."""
     deadline_s: float | None = None
-    """Time limit of the command, s; that of a tare by default."""
+    """Time limit of the command, in s; that of a tare by default."""
     boot_id: str = field(default_factory=boot_id)
     """Boot ID of the program's operating system."""
     sent_ns: int = field(default_factory=clock.monotonic_ns)
-    """Time at which the program sent the command, on its monotonic clock, ns."""
+    """Time at which the program sent the command, on its monotonic clock, in ns."""
 
     @classmethod
     def decode(cls, data: bytes) -> Request:
@@ -54,7 +54,7 @@ class Request:
         """Return the time since the program sent the command, s, on this computer's monotonic clock.
 
         Args:
-            arrived_ns: Time at which the command arrived, ns; counts for a program on another machine. A
+            arrived_ns: Time at which the command arrived, in ns; counts for a program on another machine. A
                 daemon that was suspended notices the arrival late.
         """
         sent_ns = self.sent_ns if self.boot_id == boot_id() != "" else arrived_ns

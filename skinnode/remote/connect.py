@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import zenoh
 
 TIMEOUT_S: Final = 5.0
-"""Default time limit for the hand to appear, s."""
+"""Default time limit for the hand to appear, in s."""
 _POLL_S: Final = 0.02
 
 

@@ -28,7 +28,7 @@ class DaemonWatch:
         self.arrivals = 0
         """Number of daemons that have appeared so far."""
         self.t_change_ns = clock.monotonic_ns()
-        """Monotonic time at which a daemon last appeared or disappeared, ns."""
+        """Monotonic time at which a daemon last appeared or disappeared, in ns."""
         self._subscriber = session.liveliness().declare_subscriber(
             keys.hand_tokens(hand), self._on_change, history=True
         )

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import zenoh
 
 _ANSWER_S: Final = 1.0
-"""Time limit for replies from daemons and routers, s."""
+"""Time limit for replies from daemons and routers, in s."""
 
 
 def tokens(session: zenoh.Session, hand: str | None = None) -> list[str]:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 QUEUED: Final = 32
 """Capacity of the queue between the host and the thread, in fields per patch."""
 _POLL_S: Final = 0.05
-"""Maximum time until :meth:`Publication.close` takes effect, s."""
+"""Maximum time until :meth:`Publication.close` takes effect, in s."""
 
 
 @dataclass(frozen=True, slots=True)

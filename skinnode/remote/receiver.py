@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 QUEUED: Final = 64
 """Capacity of the queue between Zenoh and the thread, in messages per patch."""
 TURN_S: Final = 0.05
-"""Maximum time between two calls of ``on_turn``, s."""
+"""Maximum time between two calls of ``on_turn``, in s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Recipients:
     """Functions that receive the decoded data, called in the receiver's thread."""
 
     field: Callable[[FieldFrame, SendStamp, int], None]
-    """Receives a field with times on this machine's monotonic clock and the message's transit time, ns."""
+    """Receives a field with times on this machine's monotonic clock and the message's transit time, in ns."""
     report: Callable[[HealthReport], None]
     event: Callable[[HealthEvent], None]
     on_turn: Callable[[], None]
@@ -48,7 +48,7 @@ class _Item(NamedTuple):
     data: bytes
     attachment: bytes
     t_ns: int
-    """Time since 1970 at which the message arrived, ns."""
+    """Time since 1970 at which the message arrived, in ns."""
 
 
 class Receiver:

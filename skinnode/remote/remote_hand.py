@@ -278,5 +278,5 @@ class RemoteHand(RunningHand, Closing):
 
     @property
     def _silent_s(self) -> float:
-        """Time since the newest report of the described run, s."""
+        """Time since the newest report of the described run, in s."""
         return (clock.monotonic_ns() - self._t_report_ns) * 1e-9

@@ -31,19 +31,19 @@ PORTS: Final = 16
 """Number of ports, and thus maximum number of daemons, on this machine."""
 
 _RETRY: Final = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
-"""Pauses between attempts to connect, ms. A connection on this machine is re-established within 0.2 s."""
+"""Pauses between attempts to connect, in ms. A connection on this machine is re-established within 0.2 s."""
 _LEASE_MS: Final = 2000
-"""Time without messages or keep-alives after which a connection is closed, ms. A suspended process or an
+"""Time without messages or keep-alives after which a connection is closed, in ms. A suspended process or an
 unplugged cable is detected after this time; a process that ends is detected immediately."""
 _QUEUED: Final = 16
 """Number of batches (64 KiB each) queued per connection; Zenoh's maximum. Zenoh's default, 2, is too small
 for the fields of 16 patches that are solved at the same time."""
 _SETTLE_S: Final = 1.0
-"""Time limit for connecting to the other daemons and to the router at startup, s."""
+"""Time limit for connecting to the other daemons and to the router at startup, in s."""
 _ROUTER_MS: Final = 500
-"""Time limit for one attempt by a program to connect to a router, ms."""
+"""Time limit for one attempt by a program to connect to a router, in ms."""
 _PAUSE_S: Final = 0.1
-"""Pause between these attempts, s."""
+"""Pause between these attempts, in s."""
 _POLL_S: Final = 0.01
 _ENDPOINT: Final = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[^\]]+\]|[^/:\[\]]+):(\d{1,5})((?:[?#].*)?)")
 
@@ -166,7 +166,7 @@ def open_program(options: SessionOptions, end_s: float | None) -> zenoh.Session:
 
     Args:
         options: Connection options of the program.
-        end_s: Monotonic time until which to wait for the router, s; None for no limit.
+        end_s: Monotonic time until which to wait for the router, in s; None for no limit.
 
     Raises:
         ConfigError: if the configuration is invalid, or the router does not answer in time.

@@ -20,10 +20,10 @@ from skinnode.process import clock
 from skinnode.remote.output import Outputs
 
 HEALTH_S: Final = 0.25
-"""Interval between health reports, s; also the maximum delay before a new subscription to fields takes
+"""Interval between health reports, in s; also the maximum delay before a new subscription to fields takes
 effect."""
 _POLL_S: Final = 0.05
-"""Maximum time until :meth:`StatusPublication.close` takes effect, s."""
+"""Maximum time until :meth:`StatusPublication.close` takes effect, in s."""
 
 
 class Counters(Protocol):
@@ -44,7 +44,7 @@ class StatusPublication:
     Args:
         host: Running host.
         outputs: Publishers; this thread uses only those that do not belong to a patch.
-        started_ns: Time since 1970 that identifies the run of the publication, ns.
+        started_ns: Time since 1970 that identifies the run of the publication, in ns.
         counters: Function that returns the counters of the publication.
         defects: Record of exceptions.
     """

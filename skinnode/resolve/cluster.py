@@ -21,7 +21,7 @@ from skinnode.resolve.workers import MOST_DEATHS
 
 _CONNECT_S: Final = 10.0
 _GONE_S: Final = 20.0
-"""Time without a connection to the scheduler after which the cluster is considered lost, s."""
+"""Time without a connection to the scheduler after which the cluster is considered lost, in s."""
 
 
 def require_dask() -> None:

@@ -38,15 +38,15 @@ class SolveSummary:
     touched: int = 0
     contacts: int = 0
     deepest_m: float = 0.0
-    """Largest displacement into the skin, m."""
+    """Largest displacement into the skin, in m."""
     std_sum_m: float = 0.0
-    """Sum over the fields of the median standard deviation of z, m; unknown deviations are left out."""
+    """Sum over the fields of the median standard deviation of z, in m; unknown deviations are left out."""
     known_std: int = 0
     """Number of fields in ``std_sum_m``."""
     cpu_s: float = 0.0
-    """CPU time spent on solving, s."""
+    """CPU time spent on solving, in s."""
     rest_m: tuple[Float, ...] = ()
-    """(U, N, 3) electrode positions at rest for each solver, m."""
+    """(U, N, 3) electrode positions at rest for each solver, in m."""
 
     def __add__(self, other: SolveSummary) -> SolveSummary:
         return SolveSummary(

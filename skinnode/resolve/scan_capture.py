@@ -44,7 +44,7 @@ class CapturedScan:
 
     place: Place
     now_ns: int
-    """Replay time at which the scan is solved, on the host's monotonic clock, ns."""
+    """Replay time at which the scan is solved, on the host's monotonic clock, in ns."""
     scan: Scan
     stamp: ScanStamp
     verdict: Verdict

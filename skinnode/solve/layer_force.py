@@ -41,8 +41,8 @@ def stiffening(radius_m: float, thickness_m: float) -> float:
     """Return the ratio of the force on a bonded layer to that on a half-space at the same depth.
 
     Args:
-        radius_m: Radius of the contact, metres.
-        thickness_m: Thickness of the layer, metres.
+        radius_m: Radius of the contact, in metres.
+        thickness_m: Thickness of the layer, in metres.
     """
     ratio = radius_m / thickness_m
     return 1.0 + LINEAR * ratio + CUBIC * ratio**3
@@ -53,9 +53,9 @@ def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m:
 
     Args:
         rubber: The material.
-        depth_m: Depth at the centre of the contact, metres.
-        radius_m: Radius of the contact, metres.
-        thickness_m: Thickness of the layer, metres.
+        depth_m: Depth at the centre of the contact, in metres.
+        radius_m: Radius of the contact, in metres.
+        thickness_m: Thickness of the layer, in metres.
     """
     half_space_n = 4.0 / 3.0 * rubber.contact_modulus_pa * radius_m * depth_m
     return half_space_n * stiffening(radius_m, thickness_m)
@@ -65,7 +65,7 @@ def layer_std_n(bonded_n: float, force_n: float) -> float:
     """Return a standard deviation, N, that covers the force on a bonded layer.
 
     Args:
-        bonded_n: Force on a bonded layer, N.
-        force_n: Force on a half-space, N.
+        bonded_n: Force on a bonded layer, in N.
+        force_n: Force on a half-space, in N.
     """
     return math.fabs(max(bonded_n - force_n, 0.0)) / SPAN

@@ -112,7 +112,7 @@ class PosteriorOptions(EstimateOptions):
     """Options of :class:`skinnode.Posterior`: ``scale_m`` and those of :class:`EstimateOptions`.
 
     Args:
-        scale_m: RMS normal displacement in the prior, metres; by default, it is estimated from the data.
+        scale_m: RMS normal displacement in the prior, in metres; by default, it is estimated from the data.
 
     Raises:
         ValueError: If an option is out of range.
@@ -150,7 +150,7 @@ class TrackerOptions(EstimateOptions):
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
         max_std_m: Maximum standard deviation of a coordinate in a precise field, metres. The default depends
             on the layout and the noise (:mod:`skinnode.solve.precision`).
-        max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N. The
+        max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, in N. The
             default depends on the layout and the rubber, and applies only to calibrated forces.
         detect: Whether to detect touches before solving (:mod:`skinnode.solve.detect`). An untouched patch is
             then not solved, unless ``hold`` is off or ``estimate_noise`` is on.

@@ -69,7 +69,7 @@ class Tracker:
         options: Options in effect.
         method: Method in use, ``exact`` or ``posterior``. With ``auto``, it can change during a stream.
         reason: Short explanation of why this method is in use.
-        t_ns: Time of the next frame on any monotonic clock, ns. After a gap in the stream, the detector
+        t_ns: Time of the next frame on any monotonic clock, in ns. After a gap in the stream, the detector
             allows for drift in the meantime, and the posterior uses no earlier frames; if None (the default),
             gaps are not noticed.
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vcan_sim.scenes import SceneConfig
 
 _WARN_AGAIN_S = 10.0
-"""Minimum interval between warnings about a busy machine, s."""
+"""Minimum interval between warnings about a busy machine, in s."""
 
 
 def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments

@@ -22,7 +22,7 @@ class Grid:
     Attributes:
         layer: Elastic layer under the cells.
         shape: Number of cells along x and along y.
-        size_m: Side length of a cell, metres.
+        size_m: Side length of a cell, in metres.
     """
 
     layer: Layer
@@ -39,7 +39,7 @@ class Grid:
         Args:
             layer: Elastic layer under the cells.
             shape: Number of cells along x and along y.
-            size_m: Side length of a cell, metres.
+            size_m: Side length of a cell, in metres.
         """
         padded = (
             scipy.fft.next_fast_len(2 * shape[0], real=True),

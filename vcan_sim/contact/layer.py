@@ -39,8 +39,8 @@ class Layer:
     """Isotropic elastic layer on a rigid base.
 
     Args:
-        thickness_m: Thickness of the layer, metres; inf for a half-space.
-        young_pa: Young's modulus, Pa.
+        thickness_m: Thickness of the layer, in metres; inf for a half-space.
+        young_pa: Young's modulus, in Pa.
         poisson: Poisson's ratio, at most 0.5.
 
     Raises:
@@ -63,12 +63,12 @@ class Layer:
 
     @property
     def shear_modulus_pa(self) -> float:
-        """Shear modulus G of the layer, Pa."""
+        """Shear modulus G of the layer, in Pa."""
         return 0.5 * self.young_pa / (1.0 + self.poisson)
 
     @property
     def contact_modulus_pa(self) -> float:
-        """Contact modulus E* = E / (1 − ν²) between the layer and a rigid body, Pa."""
+        """Contact modulus E* = E / (1 − ν²) between the layer and a rigid body, in Pa."""
         return self.young_pa / (1.0 - self.poisson**2)
 
     def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
@@ -98,7 +98,7 @@ class PointResponse:
 
     Args:
         layer: Elastic layer of finite thickness.
-        reach_m: Maximum distance from the force, metres.
+        reach_m: Maximum distance from the force, in metres.
     """
 
     def __init__(self, layer: Layer, reach_m: float) -> None:
@@ -146,9 +146,9 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
 
     Args:
         layer: Elastic layer.
-        offset_m: (…, 2) positions relative to the centre of the cell, metres.
-        size_m: Side length of the cell, metres.
-        reach_m: Maximum distance of any position from the centre of the cell, metres.
+        offset_m: (…, 2) positions relative to the centre of the cell, in metres.
+        size_m: Side length of the cell, in metres.
+        reach_m: Maximum distance of any position from the centre of the cell, in metres.
 
     Returns:
         (…, 3, 3) displacement per unit traction, m/Pa. The last axis is the direction of the traction.

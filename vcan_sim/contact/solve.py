@@ -40,8 +40,8 @@ class Contact:
     """Tractions, displacements and stick zone of a contact between a body and the skin.
 
     Attributes:
-        traction_pa: (3, X, Y) tractions on the skin, Pa.
-        displacement_m: (3, X, Y) displacements of the surface, metres.
+        traction_pa: (3, X, Y) tractions on the skin, in Pa.
+        displacement_m: (3, X, Y) displacements of the surface, in metres.
         sticks: (X, Y) bool, True for cells in contact that do not slip.
     """
 
@@ -119,9 +119,9 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close:
 
     Args:
         grid: Cells on the surface.
-        limit_pa: (X, Y) maximum shear traction μ p, Pa.
-        target_m: (2, X, Y) displacement of each cell in the absence of slip, metres.
-        start_pa: (2, X, Y) initial guess for the shear traction, Pa.
+        limit_pa: (X, Y) maximum shear traction μ p, in Pa.
+        target_m: (2, X, Y) displacement of each cell in the absence of slip, in metres.
+        start_pa: (2, X, Y) initial guess for the shear traction, in Pa.
         close: Tolerance. The iteration stops when every shear traction changes by less than
             0.1 ``close`` times the maximum of ``limit_pa``.
 
@@ -168,7 +168,7 @@ def advance(  # noqa: PLR0913 - the last two control the search
     Args:
         grid: Cells on the surface.
         last: State of the contact before the movement.
-        overlap_m: (X, Y) overlap of the body with the undeformed surface after the movement, metres.
+        overlap_m: (X, Y) overlap of the body with the undeformed surface after the movement, in metres.
         slide_m: Tangential movement of the body's surface, metres: (2,), or (2, X, Y) if the body rotates.
         friction: Coefficient of friction μ.
         start: Initial guess for the new state; default: ``last``. The guess affects only the computing time.

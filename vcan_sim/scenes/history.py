@@ -33,12 +33,12 @@ class Step:
 
     Attributes:
         first: (2,) lattice indices of the first cell of the window.
-        traction_pa: (3, X, Y) tractions on the skin, Pa.
-        electrodes_m: (E, 3) displacement of the electrodes, metres.
-        force_n: (3,) force on the skin, N.
+        traction_pa: (3, X, Y) tractions on the skin, in Pa.
+        electrodes_m: (E, 3) displacement of the electrodes, in metres.
+        force_n: (3,) force on the skin, in N.
         moment_nm: (3,) moment of the force about the origin of the patch, N m.
         area_m2: Area of contact, m².
-        depth_m: Depth of the body's lowest point below the undeformed surface, metres.
+        depth_m: Depth of the body's lowest point below the undeformed surface, in metres.
     """
 
     first: tuple[int, int]
@@ -58,7 +58,7 @@ class History:
         shape: Shape of the body that touches the skin.
         friction: Coefficient of friction.
         window: Cells under the body.
-        step_s: Time step, s.
+        step_s: Time step, in s.
         electrodes: Electrodes whose displacement is computed.
     """
 
@@ -86,7 +86,7 @@ class History:
 
     @property
     def size_m(self) -> float:
-        """Side length of a cell, metres."""
+        """Side length of a cell, in metres."""
         return self.window.grid.size_m
 
     def step(self, number: int) -> Step | None:

@@ -12,7 +12,7 @@ from vcan_sim.scenes.tables import MotionConfig, TouchConfig
 from vcan_sim.smooth import ease, glide
 
 _EVERY_S = 0.5
-"""Default interval between the targets of a random walk, s."""
+"""Default interval between the targets of a random walk, in s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Pose:
     """Pose of a body at one instant.
 
     Attributes:
-        place_m: Position (x, y) of the lowest point of the body in the patch frame, metres.
+        place_m: Position (x, y) of the lowest point of the body in the patch frame, in metres.
         slid_m: Displacement (x, y) of the body along the skin since the touch began, excluding rolling,
             metres.
         yaw_rad: Rotation about z, rad.
@@ -39,7 +39,7 @@ def pose_at(touch: TouchConfig, t_s: float) -> Pose:
 
     Args:
         touch: Touch that the body performs.
-        t_s: Scene time, s.
+        t_s: Scene time, in s.
     """
     x, y = touch.at_m
     slid_x = slid_y = 0.0

@@ -33,8 +33,8 @@ class PatchScene:
             Curved skin is projected onto the x-y plane.
         simulation: Simulation settings, such as the seed and noise of the converter.
         number: Number of the patch in the hand.
-        step_s: Time step of the contact mechanics, s.
-        repeat_s: Period of the scene, s; None if the scene plays once.
+        step_s: Time step of the contact mechanics, in s.
+        repeat_s: Period of the scene, in s; None if the scene plays once.
         histories: Touches of the patch.
     """
 
@@ -47,7 +47,7 @@ class PatchScene:
 
     @property
     def end_s(self) -> float:
-        """Scene time at which the last touch ends, s; 0 if there are no touches."""
+        """Scene time at which the last touch ends, in s; 0 if there are no touches."""
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:
@@ -56,7 +56,7 @@ class PatchScene:
         At rest, the result is ``layout.upper_m`` itself.
 
         Args:
-            t_s: Scene time, s.
+            t_s: Scene time, in s.
         """
         moved = None
         for _, steps in self._touching(t_s):
@@ -71,7 +71,7 @@ class PatchScene:
         """Return the ground truth of the patch.
 
         Args:
-            t_s: Scene time, s.
+            t_s: Scene time, in s.
         """
         contacts, moved, wrench = [], np.zeros((self.layout.upper_m.size // 3, 3)), np.zeros(6)
         for history, steps in self._touching(t_s):
@@ -85,7 +85,7 @@ class PatchScene:
         """Compute the time steps of all touches in advance, rather than on demand.
 
         Args:
-            until_s: Scene time up to which the time steps are computed, s.
+            until_s: Scene time up to which the time steps are computed, in s.
         """
         for history in self.histories:
             if history.touch.from_s < until_s:

@@ -31,8 +31,8 @@ class Electrodes:
     """Electrodes on the surface of an elastic layer. Create instances with :meth:`of`.
 
     Attributes:
-        places_m: (E, 2) electrode positions in the patch frame, metres.
-        surface_m: Height of the undeformed surface in the patch frame, metres.
+        places_m: (E, 2) electrode positions in the patch frame, in metres.
+        surface_m: Height of the undeformed surface in the patch frame, in metres.
     """
 
     places_m: Float
@@ -42,7 +42,7 @@ class Electrodes:
     :class:`vcan_sim.contact.layer.PointResponse` for Z, A, B and K."""
     _step_m: float
     _far_m: float
-    """Distance from a point force beyond which the displacement is neglected, metres."""
+    """Distance from a point force beyond which the displacement is neglected, in metres."""
 
     @classmethod
     def of(cls, layer: Layer, places_m: Float, surface_m: float) -> Electrodes:
@@ -50,8 +50,8 @@ class Electrodes:
 
         Args:
             layer: Elastic layer.
-            places_m: (E, 2) electrode positions in the patch frame, metres.
-            surface_m: Height of the undeformed surface in the patch frame, metres.
+            places_m: (E, 2) electrode positions in the patch frame, in metres.
+            surface_m: Height of the undeformed surface in the patch frame, in metres.
         """
         reach = min(3.0 * float(np.linalg.norm(np.ptp(places_m, axis=0))) + 0.01, BEYOND * layer.thickness_m)
         table, step = _radial(layer, reach)
@@ -68,11 +68,11 @@ class Electrodes:
 
         Args:
             grid: Cells of the window.
-            origin_m: (2,) centre of the first cell in the patch frame, metres.
+            origin_m: (2,) centre of the first cell in the patch frame, in metres.
             contact: State of the contact in the window.
 
         Returns:
-            (E, 3) displacement, metres.
+            (E, 3) displacement, in metres.
         """
         moved = np.zeros((len(self.places_m), 3))
         index = (self.places_m - origin_m) / grid.size_m

@@ -41,7 +41,7 @@ class Shape:
             yaw_rad: Rotation of the body about z, rad.
 
         Returns:
-            (…,) heights above the lowest point, metres; inf outside the body.
+            (…,) heights above the lowest point, in metres; inf outside the body.
         """
         if self.round or yaw_rad == 0.0:
             return self.height(places_m)
@@ -70,7 +70,7 @@ def sphere(radius_m: float) -> Shape:
     """Return the shape of a sphere.
 
     Args:
-        radius_m: Radius, metres.
+        radius_m: Radius, in metres.
     """
     return ellipsoid((radius_m, radius_m, radius_m), "sphere")
 
@@ -79,8 +79,8 @@ def punch(radius_m: float, edge_radius_m: float) -> Shape:
     """Return the shape of a flat circular punch with a rounded rim.
 
     Args:
-        radius_m: Radius of the punch including its rim, metres.
-        edge_radius_m: Rounding radius of the rim, metres; at most ``radius_m``, 0 for a sharp rim.
+        radius_m: Radius of the punch including its rim, in metres.
+        edge_radius_m: Rounding radius of the rim, in metres; at most ``radius_m``, 0 for a sharp rim.
     """
     flat = radius_m - edge_radius_m
 
@@ -95,9 +95,9 @@ def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
     """Return the shape of a downward-pointing box edge along x, with a flank on each side.
 
     Args:
-        length_m: Length of the edge along x, metres.
+        length_m: Length of the edge along x, in metres.
         slope_rad: Angle between each flank and the skin, rad.
-        edge_radius_m: Rounding radius of the edge, metres.
+        edge_radius_m: Rounding radius of the edge, in metres.
     """
     tangent_m = edge_radius_m * math.sin(slope_rad)  # half width of the rounded part
     tangent_height_m = edge_radius_m * (1.0 - math.cos(slope_rad))
@@ -115,8 +115,8 @@ def ridge(radius_m: float, length_m: float) -> Shape:
     """Return the shape of a cylinder along x with hemispherical ends.
 
     Args:
-        radius_m: Radius of the cylinder, metres.
-        length_m: Length of the cylinder, excluding its hemispherical ends, metres.
+        radius_m: Radius of the cylinder, in metres.
+        length_m: Length of the cylinder, excluding its hemispherical ends, in metres.
     """
 
     def height(places_m: Float) -> Float:

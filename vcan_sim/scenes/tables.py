@@ -84,10 +84,10 @@ class SkinConfig(Table):
     """Elastic layer of the patches in the scene, bonded to a rigid base."""
 
     thickness_m: Length | None = None
-    """Thickness of the elastic layer, metres; default: the height of the upper electrodes above the lower
+    """Thickness of the elastic layer, in metres; default: the height of the upper electrodes above the lower
     electrodes."""
     young_pa: _Modulus | None = None
-    """Young's modulus, Pa; default: ``calibration.young_pa`` of the patch in the hand file."""
+    """Young's modulus, in Pa; default: ``calibration.young_pa`` of the patch in the hand file."""
     poisson: _Poisson | None = None
     """Poisson's ratio; default: ``calibration.poisson`` of the patch in the hand file."""
 
@@ -100,7 +100,7 @@ class BodyConfig(Table):
     shape: Annotated[BodyShape, one_of(BodyShape)]
     """Shape of the part of the body that faces the skin."""
     radius_m: Length | None = None
-    """Radius of the sphere, punch or ridge, metres."""
+    """Radius of the sphere, punch or ridge, in metres."""
     edge_radius_m: Length | None = None
     """Rounding radius (m) of the punch's rim (default: a tenth of the punch radius) or of the box's edge
     (default: 1 mm)."""
@@ -144,9 +144,9 @@ class MotionConfig(Table):
     ``turn``: rotate about z. ``walk``: slide along a random path. ``press``: change the depth or
     the force."""
     from_s: _Time
-    """Scene time at which the motion starts, s."""
+    """Scene time at which the motion starts, in s."""
     to_s: _Time
-    """Scene time at which the motion ends, s."""
+    """Scene time at which the motion ends, in s."""
     by_m: _Place | None = None
     """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its starting point."""
     by_rad: _Angle | None = None
@@ -156,9 +156,9 @@ class MotionConfig(Table):
     force_n: _Force | None = None
     """Force (N) at the end of ``press``, for a touch with ``force_n``."""
     reach_m: Length | None = None
-    """Maximum distance of the body from the start of ``walk``, metres."""
+    """Maximum distance of the body from the start of ``walk``, in metres."""
     every_s: _Duration | None = None
-    """Time between consecutive random targets of ``walk``, s; default: 0.5."""
+    """Time between consecutive random targets of ``walk``, in s; default: 0.5."""
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] | None = None
     """Random seed for ``walk``; default: 1."""
 
@@ -178,24 +178,24 @@ class TouchConfig(Table):
     patch: Name
     """Name of the touched patch, as in the hand file."""
     at_m: _Place
-    """Position [x, y] of the first contact in the patch frame, metres."""
+    """Position [x, y] of the first contact in the patch frame, in metres."""
     from_s: _Time
-    """Scene time of the first contact, s."""
+    """Scene time of the first contact, in s."""
     to_s: _Time
-    """Scene time of the last contact, s."""
+    """Scene time of the last contact, in s."""
     ramp_s: _Duration = 0.3
-    """Duration of the initial press and of the final lift, s. Both follow minimum-jerk profiles."""
+    """Duration of the initial press and of the final lift, in s. Both follow minimum-jerk profiles."""
     depth_m: Length | None = None
-    """Depth of the body's lowest point below the undeformed surface, metres. Set either ``depth_m`` or
+    """Depth of the body's lowest point below the undeformed surface, in metres. Set either ``depth_m`` or
     ``force_n``."""
     force_n: _Force | None = None
-    """Normal force of the touch, N. Set either ``force_n`` or ``depth_m``."""
+    """Normal force of the touch, in N. Set either ``force_n`` or ``depth_m``."""
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
     times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
     """Number of times the touch is performed, such as 5 for a series of five taps."""
     every_s: _Duration | None = None
-    """Interval between the starts of successive repetitions, s. Required if ``times`` is more than 1."""
+    """Interval between the starts of successive repetitions, in s. Required if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
     """Motions of the body during the touch."""
 
@@ -284,9 +284,9 @@ class FaultConfig(Table):
     """Faults as in ``vcan-sim --fault``: ``unplugged``, ``lost=0.1``, or several separated by commas. For a
     wire: ``open``, ``shorted``, ``noisy``, ``frozen`` or ``crossed``."""
     from_s: _Time = 0.0
-    """Scene time at which the faults start, s."""
+    """Scene time at which the faults start, in s."""
     to_s: _Time | None = None
-    """Scene time at which the faults end, s; default: when the scene ends or repeats."""
+    """Scene time at which the faults end, in s; default: when the scene ends or repeats."""
 
     @model_validator(mode="after")
     def _end_after_start(self) -> FaultConfig:
@@ -301,13 +301,13 @@ class SceneConfig(Table):
     name: Name = "scene"
     """Name of the scene."""
     step_s: _Step = 0.03
-    """Time step of the contact mechanics, s. The state between time steps is interpolated. Motions
+    """Time step of the contact mechanics, in s. The state between time steps is interpolated. Motions
     shorter than four time steps are therefore smoothed."""
     cells: Annotated[int, Field(ge=8, le=128), Allowed("an integer from 8 to 128")] = 20
     """Number of cells across a contact. With 20 cells, errors are below 1 % for forces and below 3 % for
     areas. The computing time grows with the square of this number."""
     repeat_s: _Duration | None = None
-    """Period after which the scene repeats, s; default: the scene plays only once."""
+    """Period after which the scene repeats, in s; default: the scene plays only once."""
     skin: SkinConfig = SkinConfig()
     imperfections: Annotated[
         Any,  # with a union type, error messages would list all of its members

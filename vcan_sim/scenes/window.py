@@ -33,7 +33,7 @@ _TURNS: Final = 12
 _SEARCHES: Final = 40
 """Maximum number of depths tried in a search for a given force."""
 _NOWHERE_M: Final = -1.0
-"""Lower limit of the overlap, metres. Points outside the body have this value."""
+"""Lower limit of the overlap, in metres. Points outside the body have this value."""
 
 
 class TooMuch(ValueError):
@@ -50,7 +50,7 @@ class Window:
 
     Attributes:
         grid: Grid of cells and their elastic response.
-        half_m: Half widths of the deepest contact along x and y, metres.
+        half_m: Half widths of the deepest contact along x and y, in metres.
         deepest_m: Depth of the deepest contact, metres, computed without friction.
         force_n: Normal force of the deepest contact, N, computed without friction.
     """
@@ -67,18 +67,18 @@ def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m
     Args:
         grid: Cells at which the overlap is computed.
         shape: Shape of the body.
-        offset_m: (2,) centre of the first cell relative to the lowest point of the body, metres.
+        offset_m: (2,) centre of the first cell relative to the lowest point of the body, in metres.
         yaw_rad: Rotation of the body about z, rad.
-        depth_m: Depth of the body's lowest point below the surface, metres.
+        depth_m: Depth of the body's lowest point below the surface, in metres.
 
     Returns:
-        (X, Y) overlap, metres; negative where the body is above the surface.
+        (X, Y) overlap, in metres; negative where the body is above the surface.
     """
     return np.maximum(depth_m - shape.over(grid.centres_m(offset_m), yaw_rad), _NOWHERE_M)
 
 
 def centred_m(grid: Grid) -> Float:
-    """Return the centre (2,) of the first cell of a grid relative to the middle of the grid, metres."""
+    """Return the centre (2,) of the first cell of a grid relative to the middle of the grid, in metres."""
     return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
 
 
@@ -101,7 +101,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
         yaws_rad: Rotations of the body during the touch, rad.
         level: Maximum depth (m) or maximum normal force (N) of the touch.
         by_force: Whether ``level`` is a force.
-        most_m: Maximum allowed depth, metres.
+        most_m: Maximum allowed depth, in metres.
         cells: Number of cells across the narrow side of the window.
         margin: Margin around the frictionless contact, relative to its half width.
 

@@ -63,7 +63,7 @@ class Paths:
     Args:
         upper_m: (U, N, 3) float64, m: upper electrodes at rest.
         lower_m: (K, M, 3) float64, m: lower electrodes.
-        radius_m: Radius of the electrodes, m; 0 for points.
+        radius_m: Radius of the electrodes, in m; 0 for points.
         strain: β, relative change in resistivity per unit strain of a path.
     """
 
@@ -149,7 +149,7 @@ def _disc(plane: Float, square: Float, radius_m: float, out: Float) -> None:
     Args:
         plane: p, squared distances from the axis of the disc, m².
         square: d², squared distances from the centre of the disc, m².
-        radius_m: a, radius of the disc, m.
+        radius_m: a, radius of the disc, in m.
         out: Array for the potentials, 1/m.
     """
     a2 = radius_m * radius_m

@@ -29,7 +29,7 @@ from skinnode.model.layout import Float
 from vcan_sim.skin.imperfections import Imperfections
 
 STEP_S: Final = 1.0 / 32.0
-"""Time step, s. It is a power of two, so the times of all steps are exact."""
+"""Time step, in s. It is a power of two, so the times of all steps are exact."""
 THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 """Thresholds r of the play operators, as fractions of the clearance; the operators have equal weights."""
 _RECENT: Final = 128
@@ -63,7 +63,7 @@ class History:
 
     Args:
         imperfections: Sizes of hysteresis and creep.
-        clearance_m: Clearance between the electrode layers, m. It scales the hysteresis thresholds.
+        clearance_m: Clearance between the electrode layers, in m. It scales the hysteresis thresholds.
     """
 
     def __init__(self, imperfections: Imperfections, clearance_m: float) -> None:
@@ -80,7 +80,7 @@ class History:
         """Return the displacement (U, N, 3) in metres at ``t_s``; None before the first load.
 
         Args:
-            t_s: Time since the start of the history, s.
+            t_s: Time since the start of the history, in s.
             load: Displacement without hysteresis and creep, as a pure function of time. A different function
                 restarts the history.
         """

@@ -86,11 +86,11 @@ class Imperfections:
     temperature_per_k: float = 2e-3
     """Relative change in resistivity per kelvin. It has no effect if ``warming_k`` is 0."""
     warming_s: float = 300.0
-    """Time constant of the temperature rise, s."""
+    """Time constant of the temperature rise, in s."""
     creep: tuple[float, float] = (0.0, 0.0)
     """Delayed displacements of the fast and slow creep terms, as fractions of the immediate displacement."""
     creep_s: tuple[float, float] = (0.3, 10.0)
-    """Time constants of the fast and slow creep terms, s."""
+    """Time constants of the fast and slow creep terms, in s."""
     hysteresis: float = 0.0
     """Fraction of the displacement that is subject to hysteresis, modelled by play operators."""
 
@@ -119,7 +119,7 @@ class Imperfections:
     virtual_ground_ohm: float = 0.0
     """Input resistance of the amplifier at each lower wire, ohm; 0 for an ideal virtual ground."""
     row_time_s: float = 0.0
-    """Time between the samples of neighbouring upper wires, s."""
+    """Time between the samples of neighbouring upper wires, in s."""
     noise: float = 0.0
     """Standard deviation of the converter's noise, as a fraction of its full scale. This noise is added to
     the scene's noise, which is relative to the reading."""
@@ -160,7 +160,7 @@ class Imperfections:
             seed: Random seed.
 
         Raises:
-            ConfigError: If the seed is not an integer of at least 0.
+            ConfigError: If the seed is not a non-negative integer.
         """
         return cls(
             seed=seed,

@@ -17,7 +17,7 @@ from vcan_sim.skin.hysteresis_and_creep import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
-"""Longest interval over which the motion of the electrodes during a scan is assumed to be linear, s."""
+"""Longest interval over which the motion of the electrodes during a scan is assumed to be linear, in s."""
 
 Surface = Callable[[float], Float]
 """Function that maps time (s) to the positions (U, N, 3) of an exact patch's upper electrodes in metres. At
@@ -77,7 +77,7 @@ class PhysicalPatch:
         """Return the upper electrodes' true positions during a scan of the patch.
 
         Args:
-            t_s: Scene time at which the first upper wire is sampled, s.
+            t_s: Scene time at which the first upper wire is sampled, in s.
             upper_m_at: Motion of the exact patch, as a pure function of time.
 
         Returns:
@@ -101,7 +101,7 @@ class PhysicalPatch:
         """Return the resistances (U, K) in ohms at the input of the converter.
 
         Args:
-            t_s: Scene time of the scan, s.
+            t_s: Scene time of the scan, in s.
             upper_m_at: Motion of the exact patch, as a pure function of time.
         """
         upper_m = self.upper_m(t_s, upper_m_at)
@@ -127,7 +127,7 @@ class PhysicalPatch:
         The scene time, in whole nanoseconds, seeds the noise.
 
         Args:
-            t_s: Scene time of the scan, s.
+            t_s: Scene time of the scan, in s.
             upper_m_at: Motion of the exact patch, as a pure function of time.
         """
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))

@@ -9,10 +9,10 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 NOMINAL_BPS: Final = range(10_000, 1_000_001)
-"""Permissible nominal bit rates of a high-speed CAN bus, bit/s."""
+"""Permissible nominal bit rates of a high-speed CAN bus, in bit/s."""
 
 MAX_DATA_BPS: Final = 8_000_000
-"""Maximum bit rate of the CAN FD data phase, bit/s."""
+"""Maximum bit rate of the CAN FD data phase, in bit/s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class BitRates:
     """
 
     nominal_bps: int = 1_000_000
-    """Nominal bit rate, bit/s."""
+    """Nominal bit rate, in bit/s."""
     data_bps: int | None = None
-    """Bit rate of the data phase, bit/s; None for a bus without CAN FD."""
+    """Bit rate of the data phase, in bit/s; None for a bus without CAN FD."""
     ticks_per_s: int = field(init=False)
     ticks_per_ns: int = field(init=False)
     nominal_ticks: int = field(init=False)

@@ -98,7 +98,7 @@ class TimedBus:
         """Queue a frame for transmission.
 
         Args:
-            time_ns: Current time, ns.
+            time_ns: Current time, in ns.
             station: Index of the sending station.
             frame: Frame to send.
 
@@ -126,7 +126,7 @@ class TimedBus:
         """Discard a station's queued frames. A transmission in progress continues.
 
         Args:
-            time_ns: Current time, ns.
+            time_ns: Current time, in ns.
             station: Index of the station.
 
         Raises:
@@ -144,7 +144,7 @@ class TimedBus:
         by an error frame.
 
         Args:
-            time_ns: Current time, ns.
+            time_ns: Current time, in ns.
             station: Index of the station.
 
         Raises:
@@ -166,7 +166,7 @@ class TimedBus:
         """Reconnect a station, and reset both of its error counters to 0.
 
         Args:
-            time_ns: Current time, ns.
+            time_ns: Current time, in ns.
             station: Index of the station.
 
         Raises:
@@ -189,7 +189,7 @@ class TimedBus:
         """Start a station's recovery from bus-off. In any other state, this method does nothing.
 
         Args:
-            time_ns: Current time, ns.
+            time_ns: Current time, in ns.
             station: Index of the station.
 
         Raises:
@@ -245,7 +245,7 @@ class TimedBus:
         """Simulate the bus up to a given time, and return the new events in chronological order.
 
         Args:
-            time_ns: End of the simulated interval, ns.
+            time_ns: End of the simulated interval, in ns.
 
         Raises:
             ValueError: If the time is earlier than in a previous call.
@@ -290,8 +290,8 @@ class TimedBus:
         """Return the bus load: the fraction of time occupied by frames, error frames and intermissions.
 
         Args:
-            from_ns: Start of the interval, ns.
-            to_ns: End of the interval, ns; at most the time of the last call.
+            from_ns: Start of the interval, in ns.
+            to_ns: End of the interval, in ns; at most the time of the last call.
 
         Raises:
             ValueError: If the interval is empty or ends in the future.

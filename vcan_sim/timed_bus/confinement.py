@@ -31,7 +31,7 @@ RECOVERY_RUN_BITS: Final = 11
 """Length in bits of a recessive run that counts towards recovery from bus-off."""
 
 SUSPEND_BITS: Final = 8
-"""Suspend transmission: extra time that an error-passive station waits after its own frame, bits."""
+"""Suspend transmission: extra time that an error-passive station waits after its own frame, in bits."""
 
 
 class ErrorState(enum.StrEnum):

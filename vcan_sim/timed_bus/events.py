@@ -33,9 +33,9 @@ class Delivered(NamedTuple):
     """Stations that received the frame. If several stations sent the same frame at once, each has its own
     event, and only the first event lists the receivers."""
     queued_ns: int
-    """Time at which the station queued the frame, ns."""
+    """Time at which the station queued the frame, in ns."""
     started_ns: int
-    """Start of frame of the successful attempt, ns."""
+    """Start of frame of the successful attempt, in ns."""
 
 
 class ErrorFrame(NamedTuple):

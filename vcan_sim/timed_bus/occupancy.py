@@ -22,8 +22,8 @@ class Occupancy:
         """Add a busy interval. It must not start before the end of the last interval.
 
         Args:
-            start_ns: Start of the interval, ns.
-            end_ns: End of the interval, ns.
+            start_ns: Start of the interval, in ns.
+            end_ns: End of the interval, in ns.
         """
         ends = self._ends
         if ends and ends[-1] == start_ns:

@@ -28,7 +28,7 @@ class StationOptions:
     capacity: int | None = None
     """Maximum number of queued frames, including the frame in transmission; None for no limit."""
     restart_ns: int | None = 0
-    """Delay from bus-off to the start of recovery, ns; None to wait for a call to
+    """Delay from bus-off to the start of recovery, in ns; None to wait for a call to
     :meth:`vcan_sim.timed_bus.bus.TimedBus.restart`."""
 
     def __post_init__(self) -> None:

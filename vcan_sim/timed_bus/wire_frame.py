@@ -14,10 +14,10 @@ from skinnode.canopen.data_length import FD_LENGTHS
 from vcan_sim.timed_bus.frame import CanFrame
 
 FLAG_BITS: Final = 6
-"""Length of one station's error flag, bits. A run of this many equal bits violates the stuff rule."""
+"""Length of one station's error flag, in bits. A run of this many equal bits violates the stuff rule."""
 
 ACK_TO_END_BITS: Final = 9
-"""Total length of the ACK slot, ACK delimiter and end of frame, bits."""
+"""Total length of the ACK slot, ACK delimiter and end of frame, in bits."""
 
 _STUFF_AFTER: Final = 5
 _FIXED_STUFF_SPACING: Final = 5

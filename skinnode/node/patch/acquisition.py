@@ -24,7 +24,7 @@ class Acquisition:
     """Baseline of a patch, and the codes of its last scan.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         source: Analogue port of the patch.
         scale: Mapping of R/R0 to codes.
         baseline_ohm: (U, K) initial R0 in ohms; None if the patch has no baseline yet.
@@ -70,7 +70,7 @@ class Acquisition:
         """Take a scan: read the source and encode the mean of the readings.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
             readings: Number of readings.
 
         Raises:
@@ -103,7 +103,7 @@ class Acquisition:
         Crossings without a valid resistance keep their R0.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
             readings: Number of readings to average.
 
         Raises:

@@ -104,7 +104,7 @@ class PatchApplication:
         """Load the baseline from the memory, or tare if there is no baseline.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         remembered = self._remembered()
         if remembered is not None:

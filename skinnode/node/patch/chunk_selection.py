@@ -13,7 +13,7 @@ class ChunkSelection:
     """Selects the chunks whose codes have changed since they were last sent.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         scale: Mapping of R/R0 to codes.
     """
 

@@ -146,7 +146,7 @@ class ScanStream:
 
         Args:
             scan: Scan to send.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         if self._scan is None:
             self._busy_ns, self._paced_ns = t_ns, 0

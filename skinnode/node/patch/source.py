@@ -28,7 +28,7 @@ class ResistanceSource(Protocol):
         tries again at the next scan.
 
         Args:
-            t_ns: Current time on the monotonic clock, ns.
+            t_ns: Current time on the monotonic clock, in ns.
         """
         ...
 
@@ -71,7 +71,7 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
     Args:
         source: Source to read.
         shape: Shape of the reading, (U, K).
-        t_ns: Current time, ns.
+        t_ns: Current time, in ns.
 
     Returns:
         Copy of the resistances in ohms, (U, K) float64.

@@ -40,7 +40,7 @@ class SourceMonitor:
         failure is reported.
 
         Args:
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         try:
             yield

@@ -72,7 +72,7 @@ class WireFaultReporter:
     """Sends emergency messages when wire faults begin and end.
 
     Args:
-        profile: Sizes of the patch.
+        profile: Dimensions of the patch.
         emcy: EMCY producer of the node.
     """
 
@@ -93,7 +93,7 @@ class WireFaultReporter:
 
         Args:
             faults: Current wire faults.
-            t_ns: Current time, ns.
+            t_ns: Current time, in ns.
         """
         reported, self._reported = self._reported, faults
         if not faults.any:

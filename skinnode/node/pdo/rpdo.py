@@ -135,7 +135,7 @@ class RpdoEngine:
         Args:
             cob_id: Identifier of the frame.
             data: Payload of the frame.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
         """
         if self._operational:
             for rpdo in tuple(self._by_cob_id.get(cob_id, ())):

@@ -83,7 +83,7 @@ class BlockUpload(Transfer):
         channel: SDO server channel.
         target: Object to read.
         upload: Value and options.
-        t_ns: Arrival time of the initiate request, ns.
+        t_ns: Arrival time of the initiate request, in ns.
 
     Raises:
         Refused: If the block size is not in the range 1 to 127.
@@ -182,7 +182,7 @@ class BlockDownload(Transfer):
         channel: SDO server channel.
         target: Object to write.
         announced: Size in bytes announced by the client, or None.
-        t_ns: Arrival time of the initiate request, ns.
+        t_ns: Arrival time of the initiate request, in ns.
         crc: Whether the client supports a CRC.
 
     Raises:

@@ -48,7 +48,7 @@ class SdoServer:
     Args:
         store: Object dictionary.
         send: Function that sends a response of eight bytes.
-        timeout_ns: Maximum time to wait for a client's next request, ns.
+        timeout_ns: Maximum time to wait for a client's next request, in ns.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class SdoServer:
 
         Args:
             request: Payload of eight bytes.
-            t_ns: Arrival time, ns.
+            t_ns: Arrival time, in ns.
         """
         transfer = self._transfer
         if request[0] == ABORT:

@@ -45,7 +45,7 @@ class Transfer(ABC):
     Args:
         channel: SDO server channel.
         target: Object to read or write.
-        t_ns: Arrival time of the initiate request, ns.
+        t_ns: Arrival time of the initiate request, in ns.
     """
 
     def __init__(self, channel: Channel, target: Target, t_ns: int) -> None:

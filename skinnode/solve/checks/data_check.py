@@ -79,7 +79,7 @@ class Excuse:
     """Result of examining a suspicious frame that loads clearly explain; it also covers similar frames."""
 
     gain: float = -math.inf
-    """Gain in log evidence from assuming a fault, nats."""
+    """Gain in log evidence from assuming a fault, in nats."""
     where: int = -1
     """Index of the suspected reading."""
     until: int = 0
@@ -418,7 +418,7 @@ class DataCheck:
         return found
 
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
-        """Return the most likely wrong readings of a frame in which several upper wires have no solution.
+        """Return the readings most likely to be wrong if several upper wires of a frame have no solution.
 
         Loads cannot explain such a frame, so the search considers only wrong readings. :meth:`check` solves
         the frame without the readings found, and reports those that disagree with the new field.

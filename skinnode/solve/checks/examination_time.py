@@ -10,14 +10,14 @@ PATIENCE: Final = 4
 """Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
 makes every subsequent frame suspicious; a press rarely does."""
 FIRST_S: Final = 3e-3
-"""Assumed duration of the first examination, s. Later examinations are timed."""
+"""Assumed duration of the first examination, in s. Later examinations are timed."""
 
 
 class ExaminationTime:
     """Time that examinations take, and the suspicious frames that there was no time to examine.
 
     Attributes:
-        expected_s: Expected duration of an examination, s.
+        expected_s: Expected duration of an examination, in s.
         is_overdue: Whether the frame is examined regardless of its deadline.
     """
 
@@ -47,7 +47,7 @@ class ExaminationTime:
         The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would miss it.
 
         Args:
-            until: Deadline, as a value of :func:`skinnode.process.clock.perf_counter`, s.
+            until: Deadline, as a value of :func:`skinnode.process.clock.perf_counter`, in s.
             seconds: Duration of the step; default: :attr:`expected_s`.
         """
         if self.is_in_time(until, seconds):
@@ -64,5 +64,5 @@ class ExaminationTime:
         return self.is_overdue or perf_counter() + seconds <= until
 
     def took(self, seconds: float) -> None:
-        """Record the duration of an examination, s."""
+        """Record the duration of an examination, in s."""
         self.expected_s = max(seconds, 0.8 * self.expected_s)

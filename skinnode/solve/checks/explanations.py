@@ -63,7 +63,7 @@ class Group:
     upper: int | None
     lower: int | None
     gain: float
-    """Gain in log evidence from treating the readings as wrong, nats."""
+    """Gain in log evidence from treating the readings as wrong, in nats."""
     kind: FaultKind = FaultKind.CONTRADICTS
 
     def mask(self, shape: tuple[int, int]) -> Mask:

@@ -49,7 +49,7 @@ class GreedySearch:
     Attributes:
         kinds: (LOADS,) kind of each step of the last search; −1 for unused entries.
         numbers: (LOADS,) index of the load, reading or wire of each step.
-        gains: (LOADS,) gain of each step in log evidence, nats.
+        gains: (LOADS,) gain of each step in log evidence, in nats.
     """
 
     def __init__(self, model: ReadingModel) -> None:
@@ -66,7 +66,7 @@ class GreedySearch:
             number: Index of κ.
             z: (U, K) changes in the readings since rest, in units of their noise.
             present: (U, K) mask of the readings to use.
-            cost: Log evidence subtracted for each wrong reading, nats.
+            cost: Log evidence subtracted for each wrong reading, in nats.
             faults: Whether the explanation may contain wrong readings.
             loads: Whether the explanation may contain loads.
         """
@@ -295,7 +295,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     numbers: Index,
     gains: Float,
 ) -> float:
-    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain, nats."""
+    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain, in nats."""
     m = z.size
     multiply_vector(p, z, weighted[:m])
     multiply_vector(response_t, weighted[:m], weighted[m:])

@@ -42,7 +42,7 @@ class LastField:
         self._frame = frame
 
     def change(self, field: FieldFrame, frame: int) -> Float | None:
-        """Return the change (U, 3N) of the displacements since the stored field, metres.
+        """Return the change (U, 3N) of the displacements since the stored field, in metres.
 
         The array is overwritten by the next call. Returns None if no field is stored, or if it is older than
         :data:`AGE` frames.

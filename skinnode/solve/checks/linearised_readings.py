@@ -54,7 +54,7 @@ class Solved:
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Largest gains in log evidence from assuming a fault, nats."""
+    """Largest gains in log evidence from assuming a fault, in nats."""
 
     readings: float
     """Gain from assuming one wrong reading or two crossed wires."""
@@ -113,7 +113,7 @@ class LinearisedReadings:
 
     @property
     def cost(self) -> float:
-        """Log evidence subtracted for each wrong reading, nats."""
+        """Log evidence subtracted for each wrong reading, in nats."""
         return math.log(max(WRONG / self.sigma, math.e))
 
     def set_complete(self, moved_m: Float, sigma: float) -> None:
@@ -151,7 +151,7 @@ class LinearisedReadings:
         """Set the changes to the logarithms of the readings over those at rest, without a field.
 
         Returns:
-            False if fewer than half of the readings are usable; the changes are then not set.
+            False if fewer than half of the readings are usable, in which case the changes are not set.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self.z)

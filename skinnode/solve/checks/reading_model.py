@@ -34,7 +34,7 @@ search for explanations of slight touches in low noise uses the smallest scales.
 MOST_USUAL: Final = 9
 """Number of prior scales prepared for a large patch: the largest scales in :data:`USUAL`."""
 STORED: Final = 180_000_000
-"""Maximum size of all stored tables, bytes. Computing the tables during a stream would delay the first
+"""Maximum size of all stored tables, in bytes. Computing the tables during a stream would delay the first
 touched frame by up to 0.1 s. The tables of the reference patch take 176 MB. For larger patches, products with
 the loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
@@ -184,7 +184,7 @@ def _model(layout: PatchLayout) -> ReadingModel:
 
 @njit
 def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
-    """Write J u / σ into ``z`` (U, K), for the displacement u = ``moved`` (U, 3N), pitches."""
+    """Write J u / σ into ``z`` (U, K), for the displacement u = ``moved`` (U, 3N), in pitches."""
     for u in range(z.shape[0]):
         multiply_vector(jacobian_[u], moved[u], z[u])
         for k in range(z.shape[1]):

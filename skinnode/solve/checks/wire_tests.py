@@ -102,7 +102,7 @@ class WireFinding:
     """The wire that is least consistent with the others."""
 
     gain: float
-    """Gain in log evidence from assuming that the wire is faulty, nats."""
+    """Gain in log evidence from assuming that the wire is faulty, in nats."""
     wire: int
     """Index of the wire: 0 to U − 1 for upper wires, U to U + K − 1 for lower wires."""
     factor: float

@@ -28,7 +28,7 @@ PATCH_DRIFT: Final = 0.02
 """Standard deviation of the change in the patch's gain over one hour, used like :data:`DRIFT`. The skin's
 temperature changes faster than its wires age."""
 MEASURED_S: Final = 2.0
-"""Interval over which a stream's random walk is measured, s. Over this interval, the measured random walk
+"""Interval over which a stream's random walk is measured, in s. Over this interval, the measured random walk
 includes any steady drift."""
 _VISIBLE: Final = 1e-9
 """Minimum singular value of a visible combination of gains, relative to the largest."""

@@ -24,11 +24,11 @@ from skinnode.solve.detect.touch_test import TouchTest
 RESIDUE: Final = 0.15
 """Fraction of a touch's peak amplitude that may remain as creep."""
 RESIDUE_S: Final = 10.0
-"""Time without change after which such a remainder is considered creep, s."""
+"""Time without change after which such a remainder is considered creep, in s."""
 FORGOTTEN_S: Final = 1800.0
-"""Time after which a touch that is indistinguishable from drift ends, s."""
+"""Time after which a touch that is indistinguishable from drift ends, in s."""
 AVERAGED_S: Final = 1.0
-"""Averaging time for a touch's readings, s. Later readings are compared with this average to detect a
+"""Averaging time for a touch's readings, in s. Later readings are compared with this average to detect a
 change."""
 
 
@@ -43,7 +43,7 @@ class HeldTouch:
     average_features: Float
     """Features of ``average``; see :class:`skinnode.solve.detect.touch_statistic.TouchBasis`."""
     period_s: float
-    """Scan period, s."""
+    """Scan period, in s."""
     creep: float
     """Energy that may remain from an earlier touch; 0 if there was none."""
     peak: float = 0.0

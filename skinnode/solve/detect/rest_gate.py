@@ -120,7 +120,7 @@ class RestGate:
         )
 
     def _count_missing(self) -> None:
-        """Pass the number of frames that are missing since the last frame to the detector."""
+        """Tell the detector how many frames have been missed since the last one."""
         last_ns, self._last_ns = self._last_ns, self.t_ns
         if last_ns is None or self.t_ns is None:
             return

@@ -26,7 +26,7 @@ from skinnode.solve.detect.gain_kernel import MEAN, WIRES, find_variances, gain_
 from skinnode.solve.detect.touch_statistic import PATCH_VARIANCES, WIRE_VARIANCES
 
 BLOCK_S: Final = 0.25
-"""Minimum duration of a block, s."""
+"""Minimum duration of a block, in s."""
 BLOCK: Final = 4
 """Minimum number of frames in a block."""
 HELD_BACK: Final = 2.0
@@ -36,18 +36,18 @@ FINER: Final = math.sqrt(2.0)
 PRIOR: Final = 8.0
 """Number of independent drift measurements after which the stated drift is ignored."""
 WITHIN_S: Final = 120.0
-"""Averaging time for a stream's drift, s."""
+"""Averaging time for a stream's drift, in s."""
 MOST_DRIFT: Final = 2.0
 """Maximum drift, relative to the stated drift."""
 OFFSET_S: Final = 600.0
-"""Averaging time for the readings' offsets, s."""
+"""Averaging time for the readings' offsets, in s."""
 OFFSET_FRAMES: Final = 100
 """Weight of an offset of zero in the average, in frames."""
 CREEP: Final = 6.0
 """Ratio of the time since the last release to the averaging time of the offsets, which is at most
 :data:`OFFSET_S`. The averaging time increases because rubber creeps back ever more slowly."""
 START_S: Final = 60.0
-"""Assumed time from the measurement of the baseline to the first frame, s."""
+"""Assumed time from the measurement of the baseline to the first frame, in s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Stream:
     unit: float
     """Median relative noise of the readings."""
     period_s: float
-    """Scan period, s."""
+    """Scan period, in s."""
     block: int
     """Number of frames in a block."""
     start: Float | None

@@ -72,7 +72,7 @@ class TouchDetector:
         baseline_ohm: (U, K) resistances at rest, ohm. Crossings without a positive, finite value are ignored.
         noise: (U, K) relative standard deviation of the readings, excluding quantization.
         rounding: (U, K) relative standard deviation of the quantization error.
-        period_s: Scan period, s.
+        period_s: Scan period, in s.
         false_alarms_per_hour: Accepted number of false alarms per hour.
         gain_std: (U + K + 1,) initial standard deviations of the gains; None for a fresh baseline.
 

@@ -15,7 +15,7 @@ DEEPEST: Final = 0.16
 TOUCHES_PER_S: Final = 1.0 / 60.0
 """Prior rate of touches, 1/s."""
 TOUCH_S: Final = 1.0
-"""Prior mean duration of a touch, s."""
+"""Prior mean duration of a touch, in s."""
 
 
 def octaves_for(noise: float) -> int:
@@ -40,7 +40,7 @@ def next_log_odds(log_odds: float, log_ratio: float, period_s: float) -> float:
     Args:
         log_odds: Log odds before the frame.
         log_ratio: Log likelihood ratio of touch to no touch for the frame.
-        period_s: Scan period, s.
+        period_s: Scan period, in s.
     """
     begins, ends = min(TOUCHES_PER_S * period_s, 0.5), min(period_s / TOUCH_S, 0.5)
     odds = bounded_exp(log_odds)

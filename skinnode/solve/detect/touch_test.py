@@ -115,7 +115,7 @@ def touch_tests(
         layout: The patch.
         ratios: (U, K) noise of each reading divided by the median, as float64.
         coded: Fraction of the noise variance that is the same in successive frames.
-        period_s: Scan period, s.
+        period_s: Scan period, in s.
         false_alarms_per_hour: Accepted number of false alarms per hour.
     """
     frames_per_alarm = 3600.0 / (period_s * false_alarms_per_hour)

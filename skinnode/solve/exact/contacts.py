@@ -71,7 +71,7 @@ class LoadFactors:
     gain: Float
     """(n,) squared singular values, the diagonal of S²."""
     rest_std: Float
-    """(n,) standard deviations of the exact inverse at rest, pitches."""
+    """(n,) standard deviations of the exact inverse at rest, in pitches."""
     free: Index
     """(n,) indices of the free coordinates, which are the unknowns of the exact inverse."""
 
@@ -115,7 +115,7 @@ class ExactContacts:
         self._ratio, self._sorted = np.empty((2, layout.upper_m.shape[0]))
         self._no_contacts: tuple[Contact, ...] = ()
         self.no_force_n = np.zeros(layout.upper_m.shape)
-        """(U, N, 3) zero forces of an untouched patch, N; read-only."""
+        """(U, N, 3) zero forces of an untouched patch, in N; read-only."""
         self.no_force_n.setflags(write=False)
         self._wire = factors.free // (3 * layout.upper_m.shape[1])
         self.reset()
@@ -283,11 +283,11 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
     """Find the largest displacement in a field and the wires with unusually large standard deviations.
 
     Args:
-        field: (2, 3UN) displacements and their standard deviations, m.
+        field: (2, 3UN) displacements and their standard deviations, in m.
         free: (n,) indices of the free coordinates.
-        rest_std: (n,) standard deviations of the free coordinates at rest, pitches.
-        pitch: Pitch, m.
-        moved: (n,) output: displacements of the free coordinates, pitches.
+        rest_std: (n,) standard deviations of the free coordinates at rest, in pitches.
+        pitch: Pitch, in m.
+        moved: (n,) output: displacements of the free coordinates, in pitches.
         ratio: (U,) output: each wire's mean ratio of a variance to the variance at rest; inf if a variance is
             infinite.
         ordered: (U,) work array.

@@ -47,7 +47,7 @@ class Frame:
     order: Index
     """(U,) indices of the upper wires, in the order in which to solve them."""
     until: float
-    """Deadline on the ``perf_counter`` clock, s; inf for no deadline."""
+    """Deadline on the ``perf_counter`` clock, in s; inf for no deadline."""
 
     @property
     def expired(self) -> bool:

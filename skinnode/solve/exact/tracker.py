@@ -63,7 +63,7 @@ class ExactTracker:
             the forces F.
         hold: Whether to keep the last position of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit for an update, µs; an update can exceed it by the time needed for one wire.
+        deadline_us: Time limit for an update, in µs; an update can exceed it by the time needed for one wire.
             Wires not processed by the deadline have the status DEADLINE and an infinite standard deviation,
             and are processed first in the next frame.
         normal_only: Whether to fix x and y at rest and solve for z only.
@@ -104,7 +104,7 @@ class ExactTracker:
         problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
         self.untouched_force_n: Float | None = None
-        """(U, N, 3) forces on an untouched patch, N; reported if no stiffness is given."""
+        """(U, N, 3) forces on an untouched patch, in N; reported if no stiffness is given."""
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6

@@ -58,13 +58,13 @@ class PathResult:
     """
 
     upper_m: Float
-    """(U, N, 3) positions of the electrodes at the last sample, metres."""
+    """(U, N, 3) positions of the electrodes at the last sample, in metres."""
     displacement_m: Float
-    """(U, N, 3) displacements of the electrodes at the last sample, metres."""
+    """(U, N, 3) displacements of the electrodes at the last sample, in metres."""
     status: tuple[Status, ...]
     """Status of each upper wire."""
     error_estimate_m: Float
-    """(U,) estimate of the largest coordinate error, metres; inf if unknown.
+    """(U,) estimate of the largest coordinate error, in metres; inf if unknown.
 
     The estimate includes errors due to the tolerance and to rounding, but not errors in the samples.
     """

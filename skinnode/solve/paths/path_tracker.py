@@ -36,7 +36,7 @@ class PathEnd:
     residual: Float
     """(U,) RMS of F/b − 1."""
     error_estimate: Float
-    """(U,) estimate of the largest coordinate error due to the tolerance and to rounding, pitches."""
+    """(U,) estimate of the largest coordinate error due to the tolerance and to rounding, in pitches."""
     inverse: Float
     """(U, n, K) ∂x/∂r."""
     side: Index

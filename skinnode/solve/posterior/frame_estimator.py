@@ -206,7 +206,7 @@ class FrameEstimator:
 
         Args:
             readings: The frame.
-            start: Time at which the update began, s.
+            start: Time at which the update began, in s.
             alone: The frame without the information of earlier frames, which determines the minimum prior
                 scale; the same as ``readings`` if None. Changes that a single frame does not show may not
                 have reached the filtered readings yet.

@@ -296,7 +296,7 @@ def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Floa
 
 
 def _ten_steps() -> list[dict[str, Any]]:
-    """Measure the time and error of a ten-step path on the layout ``staggered``.
+    """Measure the time and error of a ten-step path on the ``staggered`` layout.
 
     The first rows are for one wire with each operator; the next row is for our default step control. The last
     row is the time per wire when the whole patch of ten wires is solved.

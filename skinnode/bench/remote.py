@@ -52,8 +52,8 @@ def run(seconds: float, *, publish_only: bool, report: Callable[[Row], None]) ->
 
     Args:
         seconds: Total duration, in s.
-        publish_only: Whether to measure the host without a second process and without pings.
-        report: Function called with the figures of each round.
+        publish_only: Measure only the host, without a second process and without pings.
+        report: Function called with the results of each round.
 
     Returns:
         The rounds, their totals and the requirements.

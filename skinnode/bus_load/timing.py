@@ -276,7 +276,7 @@ class BusLoad:
 
     Args:
         bitrate_bps: nominal bit rate, in bit/s.
-        data_bitrate_bps: data bit rate of CAN FD, bit/s; by default the nominal bit rate.
+        data_bitrate_bps: CAN FD data bit rate, in bit/s; defaults to the nominal bit rate.
 
     Raises:
         ConfigError: if a bit rate is not positive.

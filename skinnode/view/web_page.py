@@ -1,8 +1,8 @@
 """Serves the rerun-sdk viewer to a browser, without any access to other computers.
 
-The SDK's page loads fonts from other computers, and its viewer sends usage statistics. This server passes on
-the page without the fonts and with a content security policy: the browser blocks every connection except to
-this server and to the data port. The page also disables the statistics setting that the viewer stores in the
+The SDK's page loads fonts from other computers, and its viewer sends usage statistics. This server removes
+the fonts from the page and adds a content security policy, so the browser blocks every connection except
+those to this server and to the data port. The page also disables the statistics setting that the viewer stores in the
 browser.
 """
 

@@ -32,10 +32,10 @@ class PatchScene:
         layout: Layout of the patch at rest, with the upper electrodes on the surface of the elastic layer.
             Curved skin is projected onto the x-y plane.
         simulation: Simulation settings, such as the seed and noise of the converter.
-        number: Number of the patch in the hand.
+        number: Patch number within the hand.
         step_s: Time step of the contact mechanics, in s.
         repeat_s: Period of the scene, in s; None if the scene plays once.
-        histories: Touches of the patch.
+        histories: Touch histories of the patch.
     """
 
     layout: PatchLayout

@@ -99,7 +99,7 @@ def _uniform_prior(elastic: ElasticPrior, free_bytes: bytes) -> UniformPrior:
 class LoadPrior:
     """Prior u ~ N(0, s² C) of the free coordinates u of a patch, for loads with individual variances.
 
-    While equal loads are expected everywhere, the prior has no large arrays of its own.
+    As long as the same load is expected everywhere, the prior needs no large arrays of its own.
 
     Args:
         elastic: Elastic prior of the patch.

@@ -2,8 +2,8 @@
 
 The SDK's page loads fonts from other computers, and its viewer sends usage statistics. This server removes
 the fonts from the page and adds a content security policy, so the browser blocks every connection except
-those to this server and to the data port. The page also disables the statistics setting that the viewer stores in the
-browser.
+those to this server and to the data port. The page also disables the statistics setting that the viewer
+stores in the browser.
 """
 
 from __future__ import annotations

@@ -74,16 +74,16 @@ def replay(
             depth_m = float(-field.displacement_m[..., 2].min())
             deepest_m[field.stamp.patch] = max(deepest_m[field.stamp.patch], depth_m)
     faults = _faults(run)
-    told = run.notes if run.has_baselines else (*run.notes, _NO_BASELINES)
+    notes = run.notes if run.has_baselines else (*run.notes, _NO_BASELINES)
     if as_json:
-        notes = {"notes": told} if told else {}
-        print(json.dumps({"patches": _patches(run, deepest_m), **notes, "faults": faults}))
+        noted = {"notes": notes} if notes else {}
+        print(json.dumps({"patches": _patches(run, deepest_m), **noted, "faults": faults}))
     else:
         for name, facts in _patches(run, deepest_m).items():
             depth_m = facts.pop("deepest_m")
             counts = "  ".join(f"{key} {value}" for key, value in facts.items())
             print(f"{name}  {counts}  deepest {1e6 * depth_m:.1f} µm")
-        for note in told:
+        for note in notes:
             print(f"note: {note}")
         for fault in faults:
             print(f"fault: {fault}")

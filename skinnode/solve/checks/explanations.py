@@ -36,8 +36,8 @@ MARGIN_OF_WIRE: Final = 20.0
 reported in 6,800 healthy frames of deep slides (noise 3e-6), nor in 270 frames with six kinds of presses
 (noise 1e-5). A smaller margin does not make a frame doubtful."""
 MARGIN_OF_READING: Final = 100.0
-"""Minimum margin for a single wrong reading to be reported, nats. In 3.6 million healthy frames, a press on
-the border reached 77 nats (``bench trust --seed 1 --only hours --hours 10``)."""
+"""Minimum margin for a single wrong reading to be reported, nats. In 1.2 million healthy frames at noise
+1e-5, two presses reached 77 and 87 nats (``bench trust --seed 1 --only hours --hours 10``)."""
 DOUBT: Final = 5.0
 """Minimum margin for a frame to be doubtful, nats. In 144 healthy frames, the margin over explanations by up
 to 8 loads was never positive."""

@@ -103,7 +103,7 @@ class LayoutConfig(Table):
     upper_wires: Count = 10
     """Number of upper wires, U; each upper wire is one row of the resistance matrix."""
     upper_electrodes: Count = 10
-    """Number of electrodes per upper wire, in N."""
+    """Number N of electrodes per upper wire."""
     lower_wires: Count | None = None
     """Number of lower wires, K; each lower wire is one column of the resistance matrix. If
     None, K is 3 N."""

@@ -166,7 +166,7 @@ class PatchLayout:
             pitch_m: Distance between neighbouring upper electrodes, in metres.
             height_m: Height of the upper electrodes above the lower layer, in metres.
             upper_wires: Number of upper wires, U.
-            upper_electrodes: Number of electrodes per upper wire, in N.
+            upper_electrodes: Number N of electrodes per upper wire.
             lower_wires: Number of lower wires, K. The default, 3 N, gives each upper wire as many resistances
                 as unknown coordinates.
             lower_electrodes: Number of electrodes per lower wire, M; the default is U.

@@ -55,7 +55,7 @@ class PatchProfile:
     columns: int
     """Number of lower wires, K."""
     upper_electrodes: int
-    """Number of electrodes per upper wire, in N."""
+    """Number N of electrodes per upper wire."""
     lower_electrodes: int
     """Number of electrodes per lower wire, M."""
     code_bits: int = 16

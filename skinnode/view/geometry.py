@@ -27,7 +27,7 @@ def triangles(wires: int, electrodes: int) -> NDArray[np.uint32]:
 
     Args:
         wires: Number of rows, U.
-        electrodes: Number of points per row, in N.
+        electrodes: Number N of points per row.
     """
     index = np.arange(wires * electrodes, dtype=np.uint32).reshape(wires, electrodes)
     here, right, above, across = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]

@@ -32,7 +32,7 @@ class FaultEvent:
     """Log entry for the start or end of a fault."""
 
     time_ns: int
-    """Time of the event, in nanoseconds since 1970."""
+    """Unix time of the event, in ns."""
     place: str
     """Name of the faulty patch or bus."""
     fault: str

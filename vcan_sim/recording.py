@@ -4,7 +4,7 @@
 file             content
 ===============  =======================================================================================
 trace.log        every frame, in ``candump -L`` format, with the name of the bus as the channel
-truth.npz        for each patch and scan: ``PATCH time_ns`` since 1970, ``PATCH device_time_us`` as in the
+truth.npz        for each patch and scan: ``PATCH time_ns`` (Unix time), ``PATCH device_time_us`` as in the
                  scan's summary, ``PATCH displacement_m`` (scans, U, N, 3) and, if there is a scene,
                  ``PATCH wrench`` (scans, 6) in N and N m
 faults.jsonl     the start and end of every fault

@@ -32,7 +32,7 @@ from skinnode.process import clock
 START_NS: Final = 1_000_000_000_000
 """Monotonic start time (ns) of a virtual clock."""
 START_WALL_NS: Final = 1_600_000_000_000_000_000
-"""Start time (ns since 1970) of a virtual clock: 2020-09-13 12:26:40 UTC."""
+"""Start of a virtual clock in Unix time (ns): 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
 """Number of clock readings without a wait after which a thread is considered to be polling."""
 POLL_S: Final = 1e-4
@@ -131,7 +131,7 @@ class VirtualClock:
         self._readings = 0
 
     def time_ns(self) -> int:
-        """Return the virtual time of day, as nanoseconds since 1970."""
+        """Return the virtual time of day as a Unix time, in ns."""
         return START_WALL_NS - START_NS + self._now_ns
 
     def sleep(self, seconds: float, /) -> None:

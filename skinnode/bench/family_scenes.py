@@ -27,7 +27,7 @@ FAMILIES: Final = ("sphere", "punch", "ridge", "dent", "edge", "two", "whole pat
 BONDED: Final = ("sphere", "punch", "ridge", "edge", "two")
 """Families with scenes on a bonded layer."""
 THICKNESSES: Final = (1.0, 2.0, 4.0)
-"""Thicknesses of the bonded layers, in heights of the upper layer."""
+"""Thicknesses of the bonded layers, as multiples of the height of the upper electrodes."""
 APART: Final = (3.0, 6.0)
 """Minimum and maximum distance between two presses, in pitches."""
 FINE: Final = 3

@@ -37,7 +37,7 @@ SEEKS: Final = 20
 HOUR_S: Final = 3600.0
 
 _BEGIN_NS: Final = 1_790_000_000_000_000_000
-"""Arbitrary time of the first frame, ns since 1970."""
+"""Arbitrary Unix time of the first frame, in ns."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,8 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
         if not found:
-            raise ConfigError("--serial", None, "a serial number, because no node without a node-ID answers")
+            needed = "a serial number, because no node without a node-ID was found"
+            raise ConfigError("--serial", None, needed)
         there = f"{len(found)}{' and more' if more else ''} nodes have no node-ID (serials {serials})"
         raise ConfigError("--serial", None, f"a serial number, because {there}")
     return found[0]

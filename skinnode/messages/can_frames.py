@@ -30,7 +30,7 @@ def frame_message(frame: Frame, frame_id: str) -> tuple[str, Any]:
     """Return the name and the content of the message for a CAN frame.
 
     Args:
-        frame: The frame; ``t_ns`` is a time since 1970.
+        frame: The frame; ``t_ns`` is a Unix time.
         frame_id: Value of ``frame_id`` in the header: the name of the bus.
     """
     data = np.frombuffer(frame.data, np.uint8)
@@ -60,7 +60,7 @@ class FrameEncoder:
         """
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the encoded frame; the frame's ``t_ns`` is a time since 1970."""
+        """Return the encoded frame; the frame's ``t_ns`` is a Unix time."""
         data = frame.data
         template = self._templates.get((frame.fd, len(data)))
         if template is None:
@@ -79,7 +79,7 @@ class FrameEncoder:
 
 
 def frame_of(data: bytes, name: str) -> Frame:
-    """Return the CAN frame from an encoded message; the frame's ``t_ns`` is a time since 1970.
+    """Return the CAN frame from an encoded message; the frame's ``t_ns`` is a Unix time.
 
     Args:
         data: CDR-encoded message.

@@ -21,7 +21,7 @@ def contacts_message(field: FieldFrame, t_ns: int) -> Any:
 
     Args:
         field: The field, with a stamp.
-        t_ns: Measurement time since 1970, in ns.
+        t_ns: Unix time of the measurement, in ns.
     """
     stamp = field.stamp
     assert stamp is not None
@@ -42,7 +42,7 @@ def contact_wrenches(field: FieldFrame, t_ns: int) -> list[Any]:
 
     Args:
         field: The field, with a stamp.
-        t_ns: Measurement time since 1970, in ns.
+        t_ns: Unix time of the measurement, in ns.
     """
     stamp = field.stamp
     assert stamp is not None

@@ -37,7 +37,7 @@ def point_cloud(field: FieldFrame, rest_m: Float, t_ns: int) -> Any:
     Args:
         field: The field, with a stamp.
         rest_m: (U, N, 3) electrode positions at rest, in m.
-        t_ns: Measurement time since 1970, in ns.
+        t_ns: Unix time of the measurement, in ns.
     """
     assert field.stamp is not None
     shape = field.displacement_m.shape
@@ -66,7 +66,7 @@ def field_info(field: FieldFrame, t_ns: int) -> Any:
 
     Args:
         field: The field, with a stamp.
-        t_ns: Measurement time since 1970, in ns.
+        t_ns: Unix time of the measurement, in ns.
     """
     stamp, stats = field.stamp, field.stats
     assert stamp is not None

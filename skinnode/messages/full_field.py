@@ -25,13 +25,13 @@ class SendStamp:
     """Sequence number and times of a field that is sent to other processes."""
 
     started_ns: int
-    """Time (ns since 1970) at which the publisher started; identifies the publisher's run."""
+    """Unix time (ns) at which the publisher started; identifies the publisher's run."""
     sequence: int
     """Sequence number of the field among its patch's fields in this run, starting at 1."""
     sent_ns: int
-    """Time (ns since 1970) at which the field was sent."""
+    """Unix time (ns) at which the field was sent."""
     wall_minus_mono_ns: int
-    """Time since 1970 minus the host's monotonic clock, in ns."""
+    """Unix time minus the host's monotonic clock, in ns."""
 
 
 def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:

@@ -39,7 +39,7 @@ def diagnostics(
         hand: Name of the hand.
         patches: Health of each patch, by name.
         buses: Health of each bus, by name.
-        t_ns: Time since 1970, in ns.
+        t_ns: Unix time, in ns.
     """
     make = message_type("diagnostic_msgs/msg/DiagnosticStatus")
     statuses = [
@@ -76,14 +76,14 @@ def log_message(event: HealthEvent, t_ns: int) -> Any:
 
     Args:
         event: The event.
-        t_ns: Event time since 1970, in ns.
+        t_ns: Unix time of the event, in ns.
     """
     level = _LOG_LEVEL[event.severity]
     return message_type(LOG)(time_of(t_ns), level, event.subject, event.text, "skinnode", event.what, 0)
 
 
 def event_of(message: Any) -> tuple[HealthEvent, int]:
-    """Return the event from an ``rcl_interfaces/Log``, with ``t_ns`` 0, and its time since 1970, in ns."""
+    """Return the event from an ``rcl_interfaces/Log``, with ``t_ns`` 0, and its Unix time, in ns."""
     t_ns = message.stamp.sec * 1_000_000_000 + message.stamp.nanosec
     return HealthEvent(0, message.name, message.function, message.msg), t_ns
 

@@ -22,7 +22,7 @@ class HealthReport:
     """Health of a hand at one instant, and its publisher's counters."""
 
     started_ns: int
-    """Time (ns since 1970) at which the publisher started; identifies the publisher's run."""
+    """Unix time (ns) at which the publisher started; identifies the publisher's run."""
     patches: Mapping[str, PatchHealth]
     buses: Mapping[str, BusHealth]
     published: Mapping[str, int]
@@ -36,7 +36,7 @@ def encode_report(report: HealthReport, t_ns: int) -> bytes:
 
     Args:
         report: The report.
-        t_ns: Time since 1970, in ns.
+        t_ns: Unix time, in ns.
     """
     table = dataclasses.asdict(report)
     del table["started_ns"]

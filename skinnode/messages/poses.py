@@ -18,7 +18,7 @@ def transforms(skeleton: Skeleton, t_ns: int) -> Any:
 
     Args:
         skeleton: Patch and link poses.
-        t_ns: Time since 1970, in ns.
+        t_ns: Unix time, in ns.
     """
     poses = [_transform(HAND, link, pose, t_ns) for link, pose in skeleton.link_poses.items() if link != HAND]
     poses += [

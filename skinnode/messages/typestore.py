@@ -80,7 +80,7 @@ def schema_text(name: str) -> str:
 
 
 def seconds_and_ns(t_ns: int) -> tuple[int, int]:
-    """Split a time since 1970 (ns) into the fields of ``builtin_interfaces/Time``.
+    """Split a Unix time (ns) into the fields of ``builtin_interfaces/Time``.
 
     A time before 1970 or after 2038, which the message cannot hold, is clamped to the nearest possible time.
     """
@@ -88,10 +88,10 @@ def seconds_and_ns(t_ns: int) -> tuple[int, int]:
 
 
 def time_of(t_ns: int) -> Any:
-    """Return a ``builtin_interfaces/Time`` for a time since 1970 (ns)."""
+    """Return a ``builtin_interfaces/Time`` for a Unix time (ns)."""
     return message_type("builtin_interfaces/msg/Time")(*seconds_and_ns(t_ns))
 
 
 def header(t_ns: int, frame_id: str) -> Any:
-    """Return a ``std_msgs/Header`` with a time since 1970 (ns) and a coordinate-frame name."""
+    """Return a ``std_msgs/Header`` with a Unix time (ns) and the name of a coordinate frame."""
     return message_type("std_msgs/msg/Header")(time_of(t_ns), frame_id)

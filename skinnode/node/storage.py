@@ -73,7 +73,7 @@ class Storage:
 
     @property
     def has_memory(self) -> bool:
-        """Whether the node has a memory."""
+        """Whether the node has non-volatile memory."""
         return self._memory is not None
 
     def load(self) -> None:

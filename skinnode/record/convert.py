@@ -192,7 +192,7 @@ def write_computed_field(file: McapFile, field: FieldFrame, rest_m: Float, offse
         file: The file.
         field: The field; must have a stamp.
         rest_m: (U, N, 3) electrode positions at rest, in m.
-        offset_ns: Time since 1970 minus time on the stamp's clock, in ns.
+        offset_ns: Unix time minus time on the stamp's clock, in ns.
     """
     assert field.stamp is not None
     file.write_field(field, rest_m, offset_ns, field.stamp.t_receive_ns + offset_ns)

@@ -34,7 +34,7 @@ NUMBERS: Final = {
     "touched": "|i1",
     "touch_odds": "<f8",
 }
-"""Columns with one number per field, and their types. ``time_ns`` is the time in ns since 1970 of the SYNC
+"""Columns with one number per field, and their types. ``time_ns`` is the Unix time (ns) of the SYNC
 or, if the SYNC is unknown, of the last frame. The other times are on the host's monotonic clock. ``touched``
 is 1 or 0, or -1 if unknown; unknown ``touch_odds`` are NaN."""
 TEXTS: Final = ("method", "distrust")
@@ -76,7 +76,7 @@ def row_of(field: FieldFrame, resistance: ResistanceFrame, offset_ns: int) -> Fi
     Args:
         field: The field; must have a stamp.
         resistance: Resistances from which the field was computed.
-        offset_ns: Time since 1970 minus time on the stamp's clock, in ns.
+        offset_ns: Unix time minus time on the stamp's clock, in ns.
     """
     stamp, shape = field.stamp, field.displacement_m.shape
     assert stamp is not None

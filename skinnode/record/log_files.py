@@ -47,7 +47,7 @@ class LogFiles:
         return self._log.frames
 
     def write(self, bus: str, frame: Frame, *, sent: bool, log_ns: int) -> None:
-        """Write a frame. The frame's ``t_ns`` is a time since 1970; the format cannot store ``log_ns``."""
+        """Write a frame. The frame's ``t_ns`` is a Unix time; the format cannot store ``log_ns``."""
         self._log.write(LoggedFrame(frame, self._channels[bus], sent))
 
     def write_line(self, line: str, log_ns: int) -> None:

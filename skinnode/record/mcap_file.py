@@ -97,9 +97,9 @@ class McapFile:
 
         Args:
             bus: Name of the bus.
-            frame: The frame; ``t_ns`` is a time since 1970.
+            frame: The frame; ``t_ns`` is a Unix time.
             sent: Whether the host sent the frame.
-            log_ns: Time since 1970 at which the recorder received the frame, in ns.
+            log_ns: Unix time at which the recorder received the frame, in ns.
         """
         channel = self._frame_channels.get((bus, sent, frame.fd))
         if channel is None:
@@ -117,8 +117,8 @@ class McapFile:
         Args:
             field: The field; must have a stamp.
             rest_m: (U, N, 3) electrode positions at rest, in m.
-            offset_ns: Time since 1970 minus time on the stamp's clock, in ns.
-            log_ns: Time since 1970 at which the recorder received the field, in ns.
+            offset_ns: Unix time minus time on the stamp's clock, in ns.
+            log_ns: Unix time at which the recorder received the field, in ns.
         """
         stamp = field.stamp
         assert stamp is not None
@@ -141,7 +141,7 @@ class McapFile:
         self._write(TF_STATIC, TRANSFORMS, transforms(self._skeleton, log_ns), log_ns, log_ns)
 
     def write_event(self, event: HealthEvent, offset_ns: int, log_ns: int) -> None:
-        """Write an event; ``offset_ns`` is the time since 1970 minus the time on the event's clock."""
+        """Write an event; ``offset_ns`` is the Unix time minus the time on the event's clock."""
         t_ns = event.t_ns + offset_ns
         self._write(self._topics.events, LOG, log_message(event, t_ns), t_ns, log_ns)
 

@@ -283,7 +283,7 @@ class Replay:
 
     @property
     def wall_minus_mono_ns(self) -> int:
-        """Difference between the time since 1970 and the recording host's monotonic clock, in ns."""
+        """Difference between the Unix time and the recording host's monotonic clock, in ns."""
         return self._offset_ns
 
     def clock(self) -> int:

@@ -19,7 +19,7 @@ class Attachment(NamedTuple):
     sequence: int
     """Sequence number of the message on its topic, starting at 1."""
     sent_ns: int
-    """Time since 1970 at which the message was sent, in ns."""
+    """Unix time at which the message was sent, in ns."""
     gid: bytes
     """ID of the publisher, 16 bytes."""
 

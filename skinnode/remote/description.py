@@ -42,7 +42,7 @@ class Description:
     commands: bool
     """Whether the daemon accepts commands."""
     started_ns: int
-    """Time since 1970 at which the daemon started, ns; identifies its run, as in its fields and reports."""
+    """Unix time at which the daemon started, ns; identifies its run, as in its fields and reports."""
 
     def agrees_with(self, other: Description) -> bool:
         """Return whether both descriptions have the same configuration and the same electrodes."""

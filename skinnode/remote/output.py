@@ -60,7 +60,7 @@ class Output:
 
         Args:
             data: CDR-encoded message.
-            sent_ns: Time since 1970, in ns.
+            sent_ns: Unix time, in ns.
         """
         self._sequence += 1
         attachment = Attachment(self._sequence, sent_ns, self._gid)

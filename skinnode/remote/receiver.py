@@ -48,7 +48,7 @@ class _Item(NamedTuple):
     data: bytes
     attachment: bytes
     t_ns: int
-    """Time since 1970 at which the message arrived, in ns."""
+    """Unix time at which the message arrived, in ns."""
 
 
 class Receiver:

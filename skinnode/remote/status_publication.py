@@ -44,7 +44,7 @@ class StatusPublication:
     Args:
         host: Running host.
         outputs: Publishers; this thread uses only those that do not belong to a patch.
-        started_ns: Time since 1970 that identifies the run of the publication, in ns.
+        started_ns: Unix time that identifies the run of the publication, in ns.
         counters: Function that returns the counters of the publication.
         defects: Record of exceptions.
     """
@@ -64,7 +64,7 @@ class StatusPublication:
         self._due_s = 0.0
         self._over = clock.event()
         self.wall_minus_mono_ns = clock.time_ns() - clock.monotonic_ns()
-        """Time since 1970 minus the monotonic clock, ns, as of the newest report."""
+        """Unix time minus the monotonic clock, ns, as of the newest report."""
         self._thread = clock.thread(target=self._run, name="publish status")
         self._thread.start()
 

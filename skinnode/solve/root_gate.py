@@ -66,7 +66,7 @@ class RootGate:
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
-        self._pause = 0  # remaining number of frames without a posterior solve
+        self._pause = 0  # frames left until the next posterior solve
         self.hurried = False
         """Whether the last call to :meth:`check` had too little time to check all doubtful roots."""
         self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, in m

@@ -20,7 +20,7 @@ RETURN = 0x7000_0000
 
 
 class CortexM0:
-    """Emulated Cortex-M0+ with a program.
+    """Emulator of a Cortex-M0+ that runs a program.
 
     Args:
         elf: Program linked to :data:`FLASH` and :data:`RAM`, without initialised data.

@@ -118,7 +118,7 @@ class TimedBus:
             return False
         self._number += 1
         sender.queue.push(Waiting(arbitration_key(frame), self._number, time_ns, frame))
-        if station not in self._pending:  # otherwise, it already takes part in the next arbitration
+        if station not in self._pending:  # otherwise, it is already waiting for the next arbitration
             self._offer(sender)
         return True
 

@@ -49,7 +49,7 @@ MOST_VECTORS: Final = 96
 number."""
 WIRE_VARIANCES: Final = (*(2.0 ** np.arange(-9.0, 2.0)).tolist(), 1e6)
 """Variances of a wire's gain about the mean of its layer, in units of a reading's noise variance. The
-smallest has little effect on the test; with the largest, the gains are unknown."""
+smallest hardly affects the test; the largest leaves the gains practically unconstrained."""
 PATCH_VARIANCES: Final = (*(2.0 ** np.arange(-12.0, 0.0)).tolist(), 1e6)
 """Variances of the patch's gain, in the same units as :data:`WIRE_VARIANCES`."""
 

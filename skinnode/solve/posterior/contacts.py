@@ -36,7 +36,7 @@ pulling loads are left out. The half-space model needs pulling loads at the rim 
 displacement of a supported layer. In measurements, the ratio was at most 0.15 on bonded layers of up to 8 mm,
 and at least 0.33 on a half-space."""
 PULLED_OFF: Final = 0.1
-"""Standard deviation of a contact's centre along the surface if pulling loads are left out, in cell widths.
+"""Standard deviation, in cell widths, of the position of a contact's centre if its pulling loads are ignored.
 The measured RMS error on layers of 2 to 8 mm was at most 0.11 cell widths."""
 BEYOND: Final = 1.0
 """Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring

@@ -116,5 +116,11 @@ def _print(done: list[Tared]) -> None:
 def _result(item: Tared) -> str:
     if not item.done:
         return f"NOT TARED: {item.problem}"
+    from skinnode.model.baseline_change import TOUCHED
+
     change = "" if item.median_change is None else f", median change {100 * item.median_change:+.3f} %"
-    return f"tared: {item.crossings} crossings, median R0 {item.median_ohm:.4g} ohm{change}"
+    text = f"tared: {item.crossings} crossings, median R0 {item.median_ohm:.4g} ohm{change}"
+    if item.touched_crossings:
+        text += f"; warning: {item.touched_crossings} crossings changed by up to "
+        text += f"{100 * item.touched_change:.2g} %, {TOUCHED}"
+    return text

@@ -23,6 +23,7 @@ from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.diagnose.data_sheet import read_profile
 from skinnode.errors import BusError, NodeError, SdoAbort
 from skinnode.host.sdo_client import RemoteOd
+from skinnode.model.baseline_change import touched_crossings
 from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
@@ -56,6 +57,10 @@ class Tared:
     """Median of the new R0 values, in ohms."""
     median_change: float | None = None
     """Median of (new R0 / old R0) − 1; None if there were no old R0 values."""
+    touched_crossings: int = 0
+    """Number of crossings whose R0 changed as if something had touched the skin at this or the last tare."""
+    touched_change: float = 0.0
+    """Largest relative change of these crossings, apart from the changes of their wires."""
 
     @property
     def done(self) -> bool:
@@ -133,7 +138,8 @@ def _tare(
     change = float(np.median(after[known] / before[known] - 1.0)) if known.any() else None
     median_ohm = float(np.median(after[good])) if good.any() else None
     problem = f"{missing} of {after.size} crossings have no baseline" if missing else ""
-    return Tared(patch, node_id, connection.bus.name, problem, int(good.sum()), median_ohm, change)
+    touched = touched_crossings(before, after)
+    return Tared(patch, node_id, connection.bus.name, problem, int(good.sum()), median_ohm, change, *touched)
 
 
 def _runs(connection: BusConnection, node_id: int) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from skinnode.errors import BusError, ConfigError
 from skinnode.host.sdo_client import Abandoned
 from skinnode.host.supervised import JOIN_DEADLINE_S, LEAST_NS, Joined, Supervised
+from skinnode.model.baseline_change import TOUCHED, touched_crossings
 from skinnode.process import clock
 
 _log = logging.getLogger(__name__)
@@ -111,6 +112,12 @@ def note_baseline(node: Supervised) -> None:
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # called only after bring-up
     node.baseline_ohm = facts.baseline_ohm
+    count, change = (0, 0.0) if before is None else touched_crossings(before, facts.baseline_ohm)
+    if count:
+        _log.warning(
+            "patch %s: %d crossings of the new baseline changed by up to %.2g %%, %s",
+            *(node.remote.patch.name, count, 100 * change, TOUCHED),
+        )
     if node.announced or (before is not None and not np.array_equal(before, facts.baseline_ohm)):
         node.announced = False
         node.baselines += 1

@@ -101,3 +101,21 @@ def test_a_host_that_runs_reads_the_new_baseline_and_goes_on(
             assert time.monotonic() < end_s, host.health(name)
             time.sleep(0.02)
         assert (stream.assembler.chunks_lost, stream.assembler.scans_torn) == (0, 0)
+
+
+def test_a_touch_during_the_tare_is_said(bus: BusConfig, powered: Powered) -> None:
+    source = Rest(LAYOUT)
+    powered(bus, 5, source=source)
+
+    def press(ohm: Any) -> Any:
+        pressed = 0.98 * ohm
+        pressed[1, 1] *= 0.9
+        return pressed
+
+    source.change = press
+    touched = run(["tare", "5"], bus)
+    assert touched.status == 0, touched.stderr
+    assert "as if something touched the skin now or at the previous tare" in touched.stdout
+    source.change = lambda ohm: ohm
+    assert run(["tare", "5", "--json"], bus).json[0]["touched_crossings"] > 0, "the old baseline was touched"
+    assert run(["tare", "5", "--json"], bus).json[0]["touched_crossings"] == 0

@@ -105,11 +105,15 @@ class SkinTest:
         from skinnode.config import HandConfig, load_hand
         from vcan_sim.fleet import Fleet
         from vcan_sim.scenes import SceneConfig, load_scene
+        from vcan_sim.scenes.library import scene_file
 
         if self.fleet is not None:
             raise RuntimeError("skin_hand: called twice, but a test can have only one hand")
         plan = self._on_bus(hand if isinstance(hand, HandConfig) else load_hand(Path(hand)))
-        self.scene = scene if isinstance(scene, SceneConfig | None) else load_scene(scene, plan)
+        if isinstance(scene, SceneConfig | None):
+            self.scene = scene
+        else:
+            self.scene = load_scene(scene_file(Path(scene), "scene"), plan)
         for bus in plan.buses:
             self._traces.append(self._trace(bus))
         self.fleet = self._open.enter_context(Fleet(plan, scene=self.scene, **options))
@@ -278,8 +282,9 @@ def _skin_test(request: pytest.FixtureRequest, skin_clock: Any) -> Iterator[Skin
 def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
     """Function that powers on a simulated hand: ``skin_hand(hand, scene=None, **options) -> Fleet``.
 
-    ``hand`` and ``scene`` are files or configurations, and ``options`` are arguments of
-    :class:`vcan_sim.fleet.Fleet`. ``--skin-bus`` overrides the interface and channel of every bus.
+    ``hand`` and ``scene`` are files or configurations; ``scene`` may also be the name of a shipped scene.
+    The ``options`` are arguments of :class:`vcan_sim.fleet.Fleet`. ``--skin-bus`` overrides the interface and
+    channel of every bus.
     """
 
     def start(

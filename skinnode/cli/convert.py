@@ -61,6 +61,8 @@ def convert(
     from skinnode.record.convert import convert as run
     from skinnode.record.open_recording import FRAME_FILES
 
+    if frames_only and target.suffix != ".mcap":
+        raise ConfigError("--frames-only", str(target), "only with an .mcap target")
     plan = None if hand is None else load_hand(hand)
     if source.suffix in FRAME_FILES and target.suffix not in (*TARGETS, _RRD):
         raise ConfigError("target", str(target), ending_in((*TARGETS, _RRD)))

@@ -37,8 +37,11 @@ def replay(
         ),
     ] = None,
     speed: Annotated[
-        float, typer.Option(help="Playback speed: 1 is as recorded, 2 is twice as fast.", metavar="X")
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            help="Playback speed: 1 is as recorded, 2 is twice as fast.", metavar="X", show_default="1"
+        ),
+    ] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Play as fast as the scans can be solved.")] = False,
     as_json: Annotated[
         bool,
@@ -60,12 +63,16 @@ def replay(
     exit status is 2 if the recording cannot be read.
     """
     from skinnode.config import load_hand
+    from skinnode.errors import ConfigError
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
 
+    if fast and speed is not None:
+        raise ConfigError("--speed", speed, "no speed with --fast")
     plan = None if hand is None else load_hand(hand)
+    factor = None if fast else 1.0 if speed is None else speed
     with stop_on_signal() as stop:
-        run = play(recording, speed=None if fast else speed, cancelled=stop.is_set, hand=plan)
+        run = play(recording, speed=factor, cancelled=stop.is_set, hand=plan)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
             assert field.stamp is not None  # the host timestamps every field

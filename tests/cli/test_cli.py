@@ -116,6 +116,11 @@ def skinnode_version() -> str:
             "scan --bitrat 1",
             "skinnode scan: no such option: --bitrat (Possible options: --bitrate",
         ),
+        ("replay x.log --fast --speed 2", "--speed: got 2.0, allowed: no speed with --fast"),
+        (
+            "convert x.log y.npz --frames-only",
+            "--frames-only: got 'y.npz', allowed: only with an .mcap target",
+        ),
         ("scan --bitrate x", "skinnode scan: --bitrate: got 'x', allowed: an integer"),
         ("scan --bitrate 5", "--bitrate: got 5, allowed: a bit rate from 10000 to 1000000"),
         ("doctor x.toml --bitrate 5", "--bitrate: got 5, allowed: only without a hand file"),

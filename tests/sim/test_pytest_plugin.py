@@ -132,6 +132,19 @@ def test_what_a_failure_keeps(in_virtual_time: Run) -> None:
     assert (folder / "scene.png").read_bytes().startswith(b"\x89PNG")
 
 
+EXAMPLE = str(Path(__file__).parents[2] / "examples" / "hand.toml")
+
+
+def test_a_shipped_scene_is_played_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "test_named.py").write_text(
+        f"def test_named(skin_hand, skin_clock):\n    skin_hand({EXAMPLE!r}, scene='taps')\n\n\n"
+        "def test_unknown(skin_hand):\n    skin_hand('hand.toml', scene='tabs')\n"
+    )
+    printed = run(tmp_path, "test_named.py").stdout
+    assert "1 failed, 1 passed" in printed
+    assert "ConfigError: scene: got 'tabs', allowed: a scene file, or one of faults, press, taps" in printed
+
+
 def test_bad_use_is_one_line(tmp_path: Path) -> None:
     done = run(tmp_path, "--skin-bus=wireless")
     assert done.returncode == 4

@@ -15,11 +15,12 @@ def shipped_scenes() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 
-def scene_file(scene: Path) -> Path:
+def scene_file(scene: Path, option: str = "--scene") -> Path:
     """Return the path of a scene file.
 
     Args:
         scene: Path of the file, or name of a shipped scene. An existing file takes precedence.
+        option: Name of the option or argument in the error message.
 
     Raises:
         ConfigError: ``scene`` has no suffix and is neither a file nor a shipped scene.
@@ -28,5 +29,5 @@ def scene_file(scene: Path) -> Path:
         return scene
     shipped = shipped_scenes()
     if str(scene) not in shipped and not scene.suffix:
-        raise ConfigError("--scene", str(scene), f"a scene file, or one of {', '.join(shipped)}")
+        raise ConfigError(option, str(scene), f"a scene file, or one of {', '.join(shipped)}")
     return shipped.get(str(scene), scene)

@@ -28,7 +28,7 @@ _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
 """Minimum interval between batches of rogue frames, in ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""How far ahead flood frames are queued, in ns. This prevents gaps on a fully starved bus."""
+"""Time by which flood frames are queued in advance, in ns. This prevents gaps on a fully starved bus."""
 _MOST_AT_ONCE: Final = 256
 """Maximum number of overdue rogue frames of one kind in a batch. The rest are dropped."""
 _RETRY_S: Final = 0.05
@@ -59,8 +59,8 @@ class BusFaults:
     rogue_sync_per_s: float = 0.0
     """Rate of SYNC messages from a second master, 1/s."""
     disturbed: float = 0.0
-    """Fraction of transmissions aborted by an error frame. The sender repeats them. Only the interface
-    ``timed`` supports this fault."""
+    """Fraction of transmissions aborted by an error frame. The sender repeats them. Only the ``timed``
+    interface supports this fault."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -68,7 +68,7 @@ class BusFaults:
                 raise ConfigError(name, getattr(self, name), "a fraction from 0 to 1")
         for name in _RATES:
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise ConfigError(name, getattr(self, name), "a number of at least 0")
+                raise ConfigError(name, getattr(self, name), "a non-negative number")
 
     @property
     def needs_attacker(self) -> bool:
@@ -103,7 +103,7 @@ def check_bus(faults: BusFaults, bus: BusConfig) -> None:
         bus: Configuration of the bus.
 
     Raises:
-        ConfigError: If the fault ``disturbed`` is set on an interface other than ``timed``.
+        ConfigError: If the ``disturbed`` fault is set on an interface other than ``timed``.
     """
     if faults.disturbed and bus.interface != "timed":
         allowed = f"0 on interface {bus.interface!r}; only the interface timed simulates error frames"
@@ -130,7 +130,7 @@ class BusAttacker:
         self._syncs = 0
 
     def set(self, faults: BusFaults) -> None:
-        """Replace the faults, and start the thread when it is first needed."""
+        """Replace the faults, and start the thread if it is needed for the first time."""
         self._faults = faults
         self._changed.set()
         if faults.needs_attacker and self._thread.ident is None:

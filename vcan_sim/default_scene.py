@@ -1,4 +1,4 @@
-"""Scene in which a sphere presses into the skin, slides in a random direction and lifts off, repeatedly.
+"""Scene in which a sphere repeatedly presses into the skin, slides in a random direction and lifts off.
 
 The ground truth is free of discretisation error: the displacement of the electrodes is the closed-form
 solution for a sliding Hertz contact on a half-space (:class:`skinnode.model.elastic.HertzContact`). A scene
@@ -24,7 +24,7 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Minimum time before the first press, s. The baseline is measured on the untouched skin during this time."""
+"""Minimum time (s) before the first press. The baseline of the untouched skin is measured during it."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Durations of pressing, sliding and lifting, as fractions of a cycle. For the rest of the cycle, the skin is
@@ -35,7 +35,7 @@ _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is the unit vector of the slide."""
+    """Stroke of a sphere that presses, slides and lifts off; ``heading`` is a unit vector along the slide."""
 
     radius_m: float
     depth_m: float
@@ -85,7 +85,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time of the first touch, in s. Patches differ by up to a quarter of a cycle."""
+        """Scene time of the first touch, in s. It differs between patches by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:

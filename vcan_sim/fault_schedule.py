@@ -50,7 +50,7 @@ class FaultSchedule:
         return tuple(each for each in self.faults if each.from_s - CLOSE_S <= at_s < each.to_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
-        """Return the next scene time (s) at which a fault starts or ends; None if no fault does.
+        """Return the next scene time (s) at which a fault starts or ends; None if there is none.
 
         Args:
             t_s: Current scene time, in s.

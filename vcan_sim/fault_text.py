@@ -5,7 +5,7 @@
     text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; default: all patches or all buses
     FAULT    NAME | NAME=VALUE | none    none ends all faults of the patch or bus
 
-The option ``--fault``, the command ``vcan-sim inject`` and the ``[[faults]]`` tables of scene files use this
+The ``--fault`` option, the ``vcan-sim inject`` command and the ``[[faults]]`` tables of scene files use this
 form.
 """
 

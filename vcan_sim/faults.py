@@ -53,7 +53,7 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults whose value is a wire number, alternating between upper and lower wires."""
+"""Faults whose value is a wire number; faults of upper and lower wires alternate."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
 """Maximum absolute value of each fault that can be negative."""
@@ -64,8 +64,8 @@ class Faults:
     """Faults of one simulated node; none by default.
 
     Raises:
-        ConfigError: If a value is out of range, or if the fractions of the chunks or those of the scans add
-            up to more than 1.
+        ConfigError: If a value is out of range, or if the chunk fractions or the scan fractions add up to
+            more than 1.
     """
 
     seed: int = 1
@@ -141,10 +141,10 @@ class Faults:
     frozen: bool = False
     """Whether the converter is frozen: its readings and its conversion count stop changing."""
     uncounted: bool = False
-    """Whether the converter provides no conversion count. A host can then detect a stopped converter only
+    """Whether the converter lacks a conversion count. A host can then detect a stopped converter only
     from constant codes."""
     unplugged: bool = False
-    """Whether the node is disconnected from the bus and from power. It boots when the fault ends."""
+    """Whether the node is disconnected from the bus and the power supply. It boots when the fault ends."""
     wrong_identity: bool = False
     """Whether the node reports a wrong product code."""
     wrong_layout: bool = False
@@ -188,7 +188,7 @@ class Faults:
     """Whether the node's CAN controller is error-passive. The node reports this with emergency 0x8120."""
     duplicate_node_id: bool = False
     """Whether a second node on the bus has the same node-ID. The second node boots, responds to all commands
-    and reports skin at rest. It disappears when the fault ends."""
+    and reports an untouched patch. It disappears when the fault ends."""
     restart_every_s: float = 0.0
     """Interval between spontaneous resets of the node, in s; 0 for no resets."""
     emcy_per_s: float = 0.0
@@ -207,7 +207,7 @@ class Faults:
                 raise ConfigError(" + ".join(names), total, "at most 1 together")
         for name in OF_WIRES:
             if (wire := getattr(self, name)) is not None and wire < 0:
-                raise ConfigError(name, wire, "an integer of at least 0")
+                raise ConfigError(name, wire, "a non-negative integer")
         self._check_crossing()
         self._check_numbers()
 
@@ -220,7 +220,7 @@ class Faults:
     def _check_numbers(self) -> None:
         for name in _RATES:
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise ConfigError(name, getattr(self, name), "a number of at least 0")
+                raise ConfigError(name, getattr(self, name), "a non-negative number")
         for name, most in _MOST.items():
             if not -most <= getattr(self, name) <= most:
                 raise ConfigError(name, getattr(self, name), f"a number from {-most:g} to {most:g}")
@@ -291,7 +291,7 @@ class Injected:
     scans_spoilt: int = 0
     """Number of scans with missing or bad chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
-    """Number of data frames sent with the COB-ID of a chunk or summary, including those of second nodes."""
+    """Number of data frames sent with the COB-ID of a chunk or summary, including frames of second nodes."""
 
 
 NO_FAULTS: Final = Faults()

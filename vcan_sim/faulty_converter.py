@@ -1,4 +1,4 @@
-"""Simulated converter with injected faults, both its own and those of the wires connected to it."""
+"""Simulated converter with injected faults, including faults of the wires connected to it."""
 
 from __future__ import annotations
 

@@ -41,14 +41,14 @@ _MOST_AT_ONCE: Final = 32
 
 
 TWIN_SERIAL: Final = 0x8000_0000
-"""Bit that distinguishes the serial number of the second node from that of the first."""
+"""Bit that distinguishes the second node's serial number from the first node's."""
 
 
 class Resting:
     """Source of constant resistances, as measured on an untouched patch.
 
     Args:
-        baseline_ohm: (U, K) resistances at rest, ohm. Values of 0 or less are replaced by 1 ohm.
+        baseline_ohm: (U, K) resistances at rest, in ohms. Values of 0 or less are replaced by 1 ohm.
     """
 
     def __init__(self, baseline_ohm: Float) -> None:

@@ -58,8 +58,8 @@ class FaultyScans:
         self._half = max(1, profile.n_chunks // 2)
         self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
-        self._intact = False  # whether no fault, of this scan or an earlier one, affects this scan
-        self._counter_instead: int | None = None  # counter of a torn scan, sent again in this scan
+        self._intact = False  # whether this scan is unaffected by its own and earlier scans' faults
+        self._counter_instead: int | None = None  # counter of a torn scan, repeated in this scan
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
         self._struck = -1  # index of the chunk affected by the scan fault

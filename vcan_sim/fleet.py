@@ -29,7 +29,7 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Length of the initial part of the scene for which contact mechanics are computed before the nodes start, s.
+"""Duration (s) of the initial part of a scene whose contact mechanics are computed before the nodes start.
 The rest is computed on demand."""
 
 
@@ -149,7 +149,7 @@ class Fleet:
                     each.start(t_ns)
 
     def start(self) -> None:
-        """Compute the beginning of the scene, open the buses and power on the nodes.
+        """Compute the initial part of the scene, open the buses and power on the nodes.
 
         Raises:
             BusError: If a bus cannot be opened. Buses already opened are closed again.
@@ -232,7 +232,7 @@ class Fleet:
     def counts(self) -> dict[str, dict[str, int]]:
         """Return the nonzero counts of injected faults for each patch and each bus.
 
-        The number of PDOs is not included, because PDOs are no faults.
+        The number of PDOs is not included, because sending a PDO is not a fault.
         """
         found: dict[str, Injected | InjectedOnBus] = {
             name: self.injected_bus(name) for name in self._segments

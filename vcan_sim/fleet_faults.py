@@ -1,6 +1,6 @@
 """Current faults of the patches and buses of a simulated hand, and a log of their changes.
 
-Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, the command ``vcan-sim inject`` and the fault
+Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, the ``vcan-sim inject`` command and the fault
 schedule of a scene. Changes made together are all checked first: if one is invalid, none takes effect.
 """
 

@@ -9,7 +9,7 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Fault injector of one node. It draws faults at random and counts them.
+    """Fault injector for one node. It draws faults at random and counts them.
 
     The random sequence is reproducible: it depends only on the seed, the node-ID and the order of calls. Any
     thread may assign :attr:`faults` at any time.

@@ -8,7 +8,7 @@
         field = host.fields(timeout_s=5).get()
         assert skin_truth(field).wrench[2] < 0
 
-The option ``--skin-bus`` selects the CAN bus for all tests; by default, tests run in virtual time on a
+The ``--skin-bus`` option selects the CAN bus for all tests; by default, tests run in virtual time on a
 simulated bus. When a test fails, the plugin saves the bus trace, the scene, the ground truth and a plot, and
 names the folder in the test report.
 """
@@ -43,7 +43,7 @@ BUSES: Final = {
 """python-can interface and channel for each value of ``--skin-bus``. Braces are replaced by the number of the
 bus in the hand. If the channel is empty, each test uses a random channel."""
 TRUTH_READINGS: Final = 200
-"""Number of readings per patch, counted back from the last, whose ground truth is saved if a test fails."""
+"""Number of most recent readings per patch whose ground truth is saved if a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -64,7 +64,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker ``skin_bus``."""
+    """Register the ``skin_bus`` marker."""
     config.addinivalue_line(
         "markers", f"skin_bus(*buses): run this test only on these buses: {', '.join(BUSES)}"
     )
@@ -87,7 +87,7 @@ class SkinTest:
     """Simulated hand, host and bus traces of one test.
 
     Args:
-        bus: Value of the option ``--skin-bus``.
+        bus: Value of the ``--skin-bus`` option.
         open_until_end: Exit stack that is closed at the end of the test.
     """
 
@@ -259,7 +259,7 @@ _TEST: Final = pytest.StashKey[SkinTest]()
 
 @pytest.fixture
 def skin_clock(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The module ``skinnode.process.clock``. With ``--skin-bus timed``, the test runs in virtual time."""
+    """The ``skinnode.process.clock`` module. With ``--skin-bus timed``, the test runs in virtual time."""
     from skinnode.process import clock
     from vcan_sim.virtual_time import VirtualClock
 

@@ -38,7 +38,7 @@ SCENE: Final = "scene.json"
 
 
 def channels_of(buses: Iterable[str]) -> dict[str, str]:
-    """Return each bus's channel in a trace: its name, in which spaces become underscores.
+    """Return each bus's channel in a trace: the bus name, with spaces replaced by underscores.
 
     No two buses have the same channel.
     """

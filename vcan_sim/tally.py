@@ -1,4 +1,4 @@
-"""Frame counts by kind, for checking a host's counts against those of the simulated nodes."""
+"""Frame counts by kind, for checking a host's counts against the simulated nodes' counts."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Tally:
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus rejected."""
         self.waiting: Counter[Kind] = Counter()
-        """Chunks held back by the faults ``late`` and ``reordered``."""
+        """Chunks held back by the ``late`` and ``reordered`` faults."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()

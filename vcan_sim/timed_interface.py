@@ -39,7 +39,7 @@ class Inbox:
 
     The first frame after a pause wakes the reader immediately. Frames that arrive within the next
     :data:`COALESCED_NS` wake it once, at the end of that interval, as with interrupt coalescing in CAN
-    controllers. The time stamps of the frames are not affected.
+    controllers. The timestamps of the frames are not affected.
 
     Args:
         clock: Virtual clock of the reader.
@@ -121,7 +121,7 @@ class Segment:
         """Connect a new station and return its number."""
         station = len(self._inboxes)
         if station == MOST_STATIONS:
-            raise can.CanInitializationError(f"{self.channel}: cannot open another endpoint after {station}")
+            raise can.CanInitializationError(f"{self.channel}: cannot open more than {station} endpoints")
         self._inboxes.append(Inbox(self.clock))
         self._connected.add(station)
         self.bus.connect(self.clock.now_ns, station)
@@ -153,7 +153,7 @@ class Segment:
         """Simulate the bus up to the current virtual time.
 
         Without this call, the simulation catches up when a frame must wake a reader, at most
-        :data:`COALESCED_NS` later. Time stamps are exact either way.
+        :data:`COALESCED_NS` later. Timestamps are exact either way.
         """
         self._deliver()
 

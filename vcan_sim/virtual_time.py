@@ -61,7 +61,7 @@ class VirtualClock:
         self._now_ns = START_NS
         self._readings = 0  # number of clock readings by the running thread since its last wait
         self._ready: deque[_Turn] = deque()
-        # Waits of the first thread ended by an exception from a signal handler: the turn and its ``waits``.
+        # Waits of the first thread that a signal handler's exception has ended: the turn and its ``waits``.
         self._interrupted: deque[tuple[_Turn, int]] = deque()
         self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
         self._number = itertools.count()
@@ -108,7 +108,7 @@ class VirtualClock:
 
     @property
     def now_ns(self) -> int:
-        """Monotonic virtual time, ns. Unlike :meth:`monotonic_ns`, it does not count as a clock reading."""
+        """Monotonic virtual time (ns). Unlike :meth:`monotonic_ns`, it does not count as a clock reading."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
@@ -233,10 +233,10 @@ class VirtualClock:
             raise error
 
     def _await_turn(self, turn: _Turn, waits: int) -> None:
-        """Block the current thread until it is its turn.
+        """Block the current thread until its turn.
 
         Python runs signal handlers in the main thread, even while another thread has the turn. If a handler
-        raises an exception, the main thread becomes ready and raises the exception when it is its turn.
+        raises an exception, the main thread becomes ready and raises the exception on its next turn.
         """
         raised: BaseException | None = None
         while True:
@@ -304,7 +304,7 @@ class _Turn:
         self.waiting: deque[_Turn] = deque()
         """Threads that wait for the same condition, including this one."""
         self.waits = 0
-        """Number of completed waits. Timers from earlier waits have a smaller number and are ignored."""
+        """Number of completed waits. Timers set for earlier waits have a smaller number and are ignored."""
         self.error: Exception | None = None
 
 

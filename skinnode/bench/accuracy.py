@@ -53,7 +53,7 @@ def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
     """Run only the families of loads that the prior does not expect, and return the results.
 
     Args:
-        scenes: Number of scenes of each family for each layout and noise.
+        scenes: Number of scenes per family, layout and noise level.
         echo: Function that prints a progress line.
     """
     figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
@@ -67,8 +67,8 @@ def run_past(scenes: int, prior: str, echo: Callable[[str], object]) -> dict[str
     """Run only the streams with and without earlier frames, and return the results.
 
     Args:
-        scenes: Number of scenes of each family.
-        prior: Prior of the loads.
+        scenes: Number of scenes per family.
+        prior: Load prior.
         echo: Function that prints a progress line.
     """
     figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}

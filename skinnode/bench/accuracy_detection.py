@@ -3,7 +3,7 @@
 The readings come from :class:`skinnode.bench.truth.Skin`, an independent forward model with closed-form
 displacements. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, like a finger pad. A *small sphere*
 has a sphere radius of 1.5 to 3.5 pitches. Pressed to a depth of 2 % into a layer half a pitch thick, it has a
-contact radius of 0.1 to 0.2 pitches and changes the readings less than the noise does. The column ``signal``
+contact radius of 0.1 to 0.2 pitches and changes the readings less than the noise does. The ``signal`` column
 shows the norm of the change in the readings, in units of the noise. A detector that knows the load, its
 position and its size in advance needs a signal of 3.6 to find 95 % of the presses within three frames
 (``REACHABLE``).
@@ -58,8 +58,8 @@ RAMPS_S: Final = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Times for slow presses to reach full depth, in s."""
 HOLD_S: Final = 600.0
 SHIFT_H: Final = 4.0
-"""Time between tares while false alarms are counted, h. Without tares, a steady drift of 1 % per hour would
-reduce some gains to zero within 100 hours."""
+"""Time between tares while false alarms are counted, in hours. Without tares, a steady drift of 1 % per hour
+would reduce some gains to zero within 100 hours."""
 DETECTOR_US: Final = 20.0
 STREAM: Final = (50.0, 99.0, 99.9, 100.0)
 """Reported percentiles of the CPU time per frame in a stream of 4,000 frames with eight touches."""
@@ -161,7 +161,7 @@ def taps(seed: int, presses: int) -> list[dict[str, Any]]:
 
 
 def slow(seed: int) -> list[dict[str, Any]]:
-    """Measure when slow presses are found, whether held presses stay touched, and when creep ends."""
+    """Measure the detection of slow presses, held presses, and creep after a release."""
     rows: list[dict[str, Any]] = []
     for depth in (0.02, 0.05, 0.1):
         for seconds in RAMPS_S:

@@ -2,7 +2,7 @@
 
 Each scene is one frame, solved from rest. A coordinate counts as moved if it moves by at least a tenth of the
 largest displacement in its scene; all others are at rest. "Error over claim" is the RMS error divided by the
-RMS standard deviation behind the 95 % interval (:attr:`skinnode.FieldFrame.core_std_m`). Deviations are
+RMS standard deviation underlying the 95 % interval (:attr:`skinnode.FieldFrame.core_std_m`). Deviations are
 errors divided by :attr:`skinnode.FieldFrame.displacement_std_m`, which also accounts for rare large errors.
 """
 
@@ -51,9 +51,9 @@ class Sample:
     error: float
     """Relative error of the displacement, ‖u − u*‖ / ‖u*‖."""
     square: tuple[float, float]
-    """Sum of squared errors, m²."""
+    """Sum of squared errors, in m²."""
     claim: tuple[float, float]
-    """Sum of reported variances, m²."""
+    """Sum of reported variances, in m²."""
     inside: tuple[int, int]
     """Number of coordinates within the 95 % interval."""
     count: tuple[int, int]

@@ -98,7 +98,7 @@ class Parts:
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene, unless all wires are held; ``truth_m`` is the (U, N, 3) true displacement, metres."""
+        """Add a scene, unless all wires are held; ``truth_m``: (U, N, 3) true displacement, in metres."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -318,7 +318,7 @@ def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes with both methods.
 
     Returns:
-        One row per layout, noise level and method, with force errors for the method ``posterior``; and the
+        One row per layout, noise level and method, with force errors for the ``posterior`` method; and the
         rows of :class:`Parts` for the errors of the posterior in all scenes.
     """
     rows, parts = [], Parts()

@@ -1,9 +1,8 @@
-"""Measures what the posterior gains from earlier frames, and what this costs when the skin moves.
+"""Measures the benefit of earlier frames for the posterior, and their cost when the skin moves.
 
 Each scene is one stream that contains all phases in :data:`PHASES`. The posterior solves the stream with and
 without earlier frames (option ``past``), from the same readings. The truth comes from the families of
-``skinnode bench accuracy --only families``: half of the rigid bodies press on a bonded layer of the
-simulator.
+``skinnode bench accuracy --only families``: half of the rigid bodies press on the simulator's bonded layer.
 """
 
 from __future__ import annotations
@@ -67,8 +66,8 @@ PHASES: Final = (
 UNTOUCHED: Final = ("rest", "release", "after release")
 """Phases in which nothing touches the patch."""
 STEPS: Final = 2
-"""Number of parts of a motion. The displacement is computed at the end of each part and interpolated linearly
-in between."""
+"""Number of parts into which a motion is divided. The displacement is computed at the end of each part and
+interpolated linearly in between."""
 CREEP: Final = 3.0
 """Number of time constants in a phase that slows down."""
 
@@ -128,12 +127,12 @@ class Sum:
 
 
 def truth(family: str, skin: Skin, number: int) -> list[tuple[str, Float]]:
-    """Return the phase and the true displacement (U, N, 3), in metres, of each frame of a scene.
+    """Return the phase and the (U, N, 3) true displacement, in metres, for each frame of a scene.
 
     Args:
         family: One of :data:`FAMILIES`.
         skin: Patch to press.
-        number: Number of the scene. In scenes with odd numbers, rigid bodies press on a bonded layer.
+        number: Number of the scene. In odd-numbered scenes, rigid bodies press on a bonded layer.
     """
     seed = [number, FAMILIES.index(family)]
     rng = np.random.default_rng([*seed, 1])
@@ -178,7 +177,7 @@ def run(scenes: int, prior: str = "cells", echo: Callable[[str], object] = lambd
 
     Args:
         scenes: Number of scenes per family; each is solved at every noise level.
-        prior: Prior of the loads, one of :data:`skinnode.solve.options.PRIORS`.
+        prior: Load prior, one of :data:`skinnode.solve.options.PRIORS`.
         echo: Function that prints a progress line.
 
     Returns:

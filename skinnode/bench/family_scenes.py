@@ -1,7 +1,7 @@
 """Scenes for the families of ``skinnode bench accuracy``: loads that violate the prior's assumptions.
 
 Half of the scenes are closed-form loads on a half-space (:mod:`skinnode.bench.trust_loads`). In the other
-half, a rigid body presses on a bonded layer of the simulator (:mod:`vcan_sim.contact`), which shares no code
+half, a rigid body presses on a bonded layer in the simulator (:mod:`vcan_sim.contact`), which shares no code
 with the solvers: the pressure is the solution of the contact problem, and friction is fully mobilised. A dent
 and a plate over the whole patch exist only in closed form.
 """
@@ -49,7 +49,7 @@ class Scene:
     force_n: Float
     """(3,), N: total force; NaN if unknown."""
     bonded: bool
-    """Whether the skin is a bonded layer of the simulator."""
+    """Whether the skin is the simulator's bonded layer."""
 
 
 def draw(  # noqa: PLR0913 - the parts of a scene

@@ -24,8 +24,8 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate. The radius is much smaller than a Newton step, so that every operator
-must shorten its step."""
+"""Trust radius, in pitches per coordinate. The radius is much smaller than a Newton step, so that every
+operator must shorten its step."""
 
 
 class NumpyWire:

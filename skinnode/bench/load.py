@@ -39,7 +39,7 @@ TICK_S: Final = 0.25e-3
 """Polling interval of the sender, in s. On a fully loaded bus, about two frames become due in each interval.
 Frames that are due together are sent together, as a USB adapter does."""
 LEAD_S: Final = 0.5
-"""Delay between the call to :meth:`Generator.begin` and the first SYNC, s."""
+"""Delay between the call to :meth:`Generator.begin` and the first SYNC, in s."""
 _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 

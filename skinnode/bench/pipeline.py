@@ -33,7 +33,8 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""SYNC period with classic CAN, ms. Four patches send 101 frames each per period, 8,080 frames/s in all."""
+"""SYNC period with classic CAN, in ms. Four patches send 101 frames each per period, 8,080 frames/s in
+all."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
 """Offset between the SYNCs of successive buses in staggered scenes, in ms. The offset lets the host solve the
@@ -48,8 +49,8 @@ SCENES: Final = (
 )
 """Scenes as triples: True for CAN FD, True for touched patches, and the offset between SYNCs in ms."""
 DEADLINE_US: Final = 1000
-"""Deadline for solving a scan, µs. For comparison, an exact inverse takes 200 µs, and its verification by the
-posterior 13 ms."""
+"""Deadline for solving a scan, in µs. For comparison, an exact inverse takes 200 µs, and its verification by
+the posterior 13 ms."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0

@@ -37,7 +37,7 @@ Row = dict[str, Any]
 
 
 class _Counts(NamedTuple):
-    """Simulator counters since its start."""
+    """Simulator counters since start-up."""
 
     cpu_s: float
     frames: int

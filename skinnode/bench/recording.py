@@ -1,7 +1,8 @@
 """Measures the size, write cost and seek time of recordings from fully loaded buses.
 
 The frames come from simulated nodes and have exact times; a replay computes the fields from the frames. A
-block of a few seconds is written repeatedly, with later times, until the recording has the requested length.
+block of a few seconds is written repeatedly, with increasing times, until the recording has the requested
+length.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def run(
 
     Args:
         buses: Number of fully loaded buses with four patches each.
-        minutes: Duration of each recording, min.
+        minutes: Duration of each recording, in minutes.
         seconds: Duration of the block of simulated traffic, in s.
         report: Function that receives each format's results as soon as they are complete.
 

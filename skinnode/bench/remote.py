@@ -222,7 +222,7 @@ def _received(pipe: Connection) -> Any:
 
 
 def line(row: Row) -> str:
-    """Format the figures of a round, or of all rounds, as a few lines of text."""
+    """Format the results of one round, or of all rounds, as a few lines of text."""
     text = (
         f"{row['seconds']:.0f} s: {row['solved']} fields solved, {row['skipped']} scans skipped, "
         f"{row['sent']} sent, {row['received']} received, {row['lost']} lost, "

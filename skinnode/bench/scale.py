@@ -43,7 +43,7 @@ FIXED: Final = 16
 TOUCHED: Final = (0, 1, 4, 16)
 """Numbers of touched patches in the hand of :data:`FIXED` patches."""
 CHANGED_SCANS: Final = 100
-"""Minimum number of scans of hands that send only changed chunks. Every tenth scan is sent in full."""
+"""Minimum number of scans for hands that send only changed chunks. Every tenth scan is sent in full."""
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0

@@ -3,10 +3,10 @@
 The host and the simulated nodes run in one process and communicate over two virtual buses. Each round injects
 one to three kinds of fault, such as dropped frames, into one or all patches, while subscribers join and
 leave. In some rounds, child processes also keep all processors busy. At the end of a round, the faults are
-removed. The next round starts when every patch is operational and publishes fields again. The resident
+removed. The next round starts when every patch is operational and publishing fields again. The resident
 memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`) are each measured twice
-while no fault is injected: after a warm-up and at the end. The number of blocks reveals even a
-leak of one object per scan. This module imports the simulator to inject the faults.
+without injected faults: after a warm-up and at the end. The number of blocks reveals even a leak of one
+object per scan. This module imports the simulator to inject the faults.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ BLOCKS: Final = 2000
 """Maximum increase in the number of memory blocks. The number normally varies by a few hundred; a leak of one
 block per scan adds 10,000 in three minutes."""
 RESIDENT_MB: Final = 8.0
-"""Maximum increase in resident memory, MB. The C allocator does not return all freed memory at once, so small
-increases are normal."""
+"""Maximum increase in resident memory, in MB. The C allocator does not return all freed memory at once, so
+small increases are normal."""
 BACK_S: Final = 15.0
 """Time limit for the recovery of all patches after a round, in s. Recovery normally takes less than a second,
 but can take longer on a loaded machine."""
@@ -61,7 +61,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Minimum number of faults in a round for which the report gives their number instead of their names."""
+"""Minimum number of faults in a round at which the report shows their count instead of their names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -155,7 +155,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
 
     Args:
         minutes: Duration of the test.
-        seed: Seed of the random faults.
+        seed: Seed for the random faults.
         report: Function that receives the progress messages.
     """
     chance = random.Random(seed)
@@ -311,7 +311,7 @@ def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
 
 
 def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
-    """Inject random faults and return their description."""
+    """Inject random faults and return a description of them."""
     if chance.random() < 0.05:
         bus = chance.choice(fleet.hand.buses).name
         fleet.bus_off(bus, off=True)
@@ -342,11 +342,11 @@ def _calm(fleet: Fleet) -> None:
 
 
 def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
-    """Wait until every patch is operational and has published a field whose SYNC was sent after the call.
+    """Wait until every patch is operational and has published a field from a SYNC sent after the call.
 
     Returns:
-        The waiting time in seconds, and a text that names the last patch to recover and what it was waiting
-        for.
+        The waiting time in seconds, and a text that names the last patch to recover and the reason for its
+        delay.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 

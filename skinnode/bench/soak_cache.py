@@ -39,7 +39,7 @@ def fill(folder: Path) -> None:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return a copy of the environment that selects the kernel cache in ``folder``."""
+    """Return a copy of the environment variables, modified to select the kernel cache in ``folder``."""
     return {**os.environ, CACHE_ENVIRONMENT: str(folder)}
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the child processes. Without permission to set it, the child processes inherit the parent's
+"""Nice value of the child processes. A child process that is not permitted to set it inherits the parent's
 nice value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0

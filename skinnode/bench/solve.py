@@ -1,9 +1,9 @@
-"""Compares the speed of our solvers with that of other libraries, one wire at a time.
+"""Compares the speed of our solvers and other libraries' solvers, one wire at a time.
 
 All solvers use the same functions for the potential F and its Jacobian J. The benchmark solves each wire of
 the reference patch for a 10 % press, starting from the solution for a 9 % press. Every solver is timed at the
-loosest tolerance that yields a displacement error of at most 1e-9. If no tolerance does, the solver is listed
-without a time.
+loosest tolerance that yields a displacement error of at most 1e-9. A solver that never reaches this error is
+listed without a time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 ACCURACY: Final = 1e-9
-"""Maximum error of a coordinate, relative to the wire's largest displacement."""
+"""Maximum coordinate error, relative to the wire's largest displacement."""
 TOLERANCES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-14, 1e-15)
 
 Solve = Callable[["Case", float], Float]
@@ -55,7 +55,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return the residual computed together with the latest Jacobian."""
+        """Return the residual that was computed together with the latest Jacobian."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
@@ -63,12 +63,12 @@ class Case:
         return self.jacobian_transposed(x).T
 
     def error(self, x: Float) -> float:
-        """Return the largest error of a coordinate of x, relative to the largest displacement."""
+        """Return the largest coordinate error of x, relative to the largest displacement."""
         return float(np.abs(x - self.truth).max()) / self.size
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """Return the (U, N, 3) displacement in metres of a smooth, sheared dent ``depth`` layer heights deep."""
+    """Return the (U, N, 3) displacement (metres) of a smooth, sheared dent ``depth`` layer heights deep."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)

@@ -1,4 +1,4 @@
-"""Solves every hard case for many seeds, and reports each method's error, uncertainty and verdict."""
+"""Solves every hard case with many random seeds, and reports each method's error, uncertainty and verdict."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of case ``number``, looked up by number because cases cannot be pickled."""
+    """Return the rows of case ``number``. Cases are looked up by number because they cannot be pickled."""
     return _rows(all_cases()[number], only, seeds)
 
 

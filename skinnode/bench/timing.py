@@ -1,4 +1,4 @@
-"""Times functions that take turns on a shared machine, and computes ratios within each round."""
+"""Times functions in turn on a shared machine, and computes the ratios of their times within each round."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from skinnode.files.output_file import write_text
 ROUNDS: Final = 31
 """Default number of rounds; odd, so that the median is one of the measured times."""
 TURN_S: Final = 4e-3
-"""Duration of a function's turn in seconds: long compared with the resolution of the clock, short compared
-with a burst of background load."""
+"""Duration of a function's turn in seconds: long compared with the clock resolution, short compared with a
+burst of background load."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time per call (µs), and median ratio of this time to that of the first function in the round."""
+    """Median time per call (µs), and median ratio to the first function's time in the same round."""
 
     call_us: float
     ratio: float
 
 
 def take_turns(candidates: Mapping[str, Callable[[], object]], *, rounds: int = ROUNDS) -> dict[str, Timing]:
-    """Time every function in every round; return its median time and its ratio to the first function."""
+    """Time every function in every round; return each function's median time and median ratio."""
     calls = {name: _calls_in_a_turn(function) for name, function in candidates.items()}
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in range(rounds):

@@ -38,7 +38,7 @@ from skinnode.text.json_values import plain
 PAIRS: Final = 500
 """Default number of streams with two randomly chosen faults."""
 PARTS: Final = ("table", "speed", "road")
-"""Names of the additional parts: earlier failures, speed versus error, and fault injection over a bus."""
+"""Names of the additional parts: earlier failures, speed versus error, and fault injection on a bus."""
 SHORT: Final[dict[str, Any]] = {
     "pairs": 20,
     "hours": 0.0,
@@ -77,7 +77,7 @@ def items(seed: int, *, pairs: int = PAIRS, hours: float = 0.1, settings: Sequen
     Args:
         seed: Seed for choosing the fault pairs.
         pairs: Number of streams with two faults.
-        hours: Total length of the streams in which false alarms are counted, patch-hours.
+        hours: Total length of the streams in which false alarms are counted, in patch-hours.
         settings: Layouts and noise levels.
     """
     found = [Item("healthy", load, setting, load) for load in LOADS for setting in settings]
@@ -133,11 +133,11 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
 
 
 class Kept:
-    """Score file with one line per solved stream, from which an interrupted run is resumed.
+    """Score file with one line per solved stream, used to resume an interrupted run.
 
     Args:
         path: File to which scores are appended; None to store nothing.
-        seed: Seed of the run; lines with a different seed are ignored.
+        seed: Seed for the run; lines with a different seed are ignored.
     """
 
     def __init__(self, path: Path | None, seed: int) -> None:
@@ -196,9 +196,9 @@ def run(  # noqa: PLR0913 - options of a command
     """Solve streams with zero, one or two faults, and long fault-free streams; check the targets.
 
     Args:
-        seed: Seed of all streams.
+        seed: Seed for all streams.
         pairs: Number of streams with two faults.
-        hours: Total length of the streams in which false alarms are counted, patch-hours.
+        hours: Total length of the streams in which false alarms are counted, in patch-hours.
         only: Substrings of section and row names; only matching rows are run. Default: all rows.
         settings: Layouts and noise levels; default: all.
         jobs: Number of processes that solve streams in parallel; the results do not depend on this number.
@@ -235,7 +235,7 @@ def with_parts(
 
     Args:
         figures: Result of :func:`run`.
-        seed: Seed of all streams.
+        seed: Seed for all streams.
         parts: Names from :data:`PARTS`.
         progress: Function that receives a line of text for each step.
     """

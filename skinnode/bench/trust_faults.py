@@ -30,14 +30,14 @@ CHUNK: Final = 3
 NOISY: Final = 3e-3
 """Relative noise of a wire with a bad contact; the simulator uses the same value."""
 SETTLE: Final = 50
-"""Number of scans at rest within which the host must detect that the hand file states an incorrect noise."""
+"""Number of scans at rest within which the host must detect an incorrect noise level in the hand file."""
 
 InPlace = Callable[[Signal], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault that occurs at a random location and time in each stream."""
+    """A fault that occurs at a random location and a random time in each stream."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None

@@ -22,7 +22,7 @@ from skinnode.model.layout import Float, PatchLayout
 
 LOADS: Final = ("sphere", "punch", "ridge", "dent", "edge", "whole patch")
 DEPTH: Final = (0.1, 0.3)
-"""Minimum and maximum depth of a load, in layer heights."""
+"""Minimum and maximum depth of a load, as fractions of the layer height."""
 SHEAR: Final = 0.3
 """Maximum coefficient of friction."""
 LINES: Final = 16
@@ -39,7 +39,7 @@ _UNKNOWN: Final = np.full(3, np.nan)
 
 @dataclass(frozen=True)
 class Punch:
-    """A press by a rigid, flat-ended cylinder (Johnson, Contact Mechanics, eqs. 3.34 to 3.37)."""
+    """A rigid flat-ended cylinder pressing on the skin (Johnson, Contact Mechanics, eqs. 3.34 to 3.37)."""
 
     center_m: tuple[float, float]
     radius_m: float
@@ -75,7 +75,7 @@ class Punch:
 
 @dataclass(frozen=True)
 class Ridge:
-    """A press by a straight edge of finite length, modelled as line loads with elliptic pressure."""
+    """A straight edge of finite length pressing on the skin, as line loads with elliptic pressure."""
 
     center_m: tuple[float, float]
     angle: float
@@ -152,7 +152,7 @@ class Dent:
 
 @dataclass(frozen=True)
 class Plate:
-    """A press by a rigid, slightly tilted plate that covers the whole patch."""
+    """A rigid, slightly tilted plate pressing on the whole patch."""
 
     center_m: tuple[float, float]
     depth_m: float
@@ -172,13 +172,13 @@ class Plate:
 
 @dataclass(frozen=True)
 class Bonded:
-    """A press with Hertz pressure on an incompressible rubber layer bonded to a rigid base.
+    """A Hertz pressure distribution on an incompressible rubber layer bonded to a rigid base.
 
     The displacement is computed with Hankel transforms. For wave number k and layer height h, let x = k h.
-    The layer's transformed deflection is that of a half-space multiplied by L(x) = (sinh 2x − 2x)/(cosh 2x +
-    2x² + 1). The transformed tangential displacement is the deflection multiplied by −2x²/(sinh 2x − 2x).
-    Both formulas follow from the biharmonic equation with zero displacement at the base and zero shear stress
-    at the surface.
+    The layer's transformed deflection is the half-space deflection multiplied by
+    L(x) = (sinh 2x − 2x)/(cosh 2x + 2x² + 1). The transformed tangential displacement is the deflection
+    multiplied by −2x²/(sinh 2x − 2x). Both formulas follow from the biharmonic equation with zero
+    displacement at the base and zero shear stress at the surface.
     """
 
     center_m: tuple[float, float]
@@ -220,7 +220,7 @@ class Bonded:
 
 
 def surface_m(layout: PatchLayout) -> tuple[Float, Float, Float]:
-    """Return the upper electrodes' (P, 2) x-y positions, and the minima and maxima, in metres."""
+    """Return the upper electrodes' (P, 2) x-y positions, and the minima and maxima of x and y, in metres."""
     points = layout.upper_m[..., :2].reshape(-1, 2)
     return points, points.min(axis=0), points.max(axis=0)
 

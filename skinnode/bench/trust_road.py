@@ -50,7 +50,7 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
 AT_ONCE: Final = 4
 """Number of patches simulated simultaneously by this process."""
 CLEAN_S: Final = 1.2
-"""Time from bring-up to the injection of the faults, in s. The first press begins during this time."""
+"""Time from bring-up to fault injection, in s. The first press begins during this time."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 

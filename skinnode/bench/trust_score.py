@@ -118,7 +118,7 @@ def trusted_wires(field: FieldFrame) -> Mask:
 
 
 def deviations(field: FieldFrame, truth_m: Float) -> Float:
-    """Return the (U, N, 3) errors in reported standard deviations; undefined ratios become inf."""
+    """Return the (U, N, 3) errors divided by their reported standard deviations; undefined ratios are inf."""
     with np.errstate(all="ignore"):
         error = np.abs(field.displacement_m - truth_m)
         ratio = np.where(error == 0.0, 0.0, error / field.displacement_std_m)

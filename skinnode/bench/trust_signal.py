@@ -206,7 +206,7 @@ def make(
 
 
 def _resistances(skin: Skin, truth: Float) -> Float:
-    """Return the (T, U, K) resistances in ohms; those of an untouched patch are computed only once."""
+    """Return the (T, U, K) resistances in ohms; the resistances at rest are computed only once."""
     ohm = np.repeat(skin.rest_ohm[None], len(truth), axis=0)
     for t in np.flatnonzero(truth.any(axis=(1, 2, 3))):
         ohm[t] = skin.resistance_ohm(truth[t])

@@ -1,4 +1,4 @@
-"""Generates ground truth for benchmarks, independently of the assumptions of the solvers.
+"""Generates ground truth for benchmarks, independently of the solvers' assumptions.
 
 Displacements are closed-form solutions for rigid spheres on rubber
 (:class:`skinnode.model.elastic.HertzContact`), which need neither a grid nor a prior. :class:`Skin` computes
@@ -26,8 +26,8 @@ EXACT_NOISE: Final = 1e-9
 """Relative noise passed to a tracker for noise-free data. This noise determines the tolerance of the
 solver."""
 RING: Final = 4
-"""Number of points on the rim of a finite electrode. The potential between two electrodes is the mean over
-all 16 pairs of points."""
+"""Number of points on the rim of an electrode of finite size. The potential between two electrodes is the
+mean over all 16 pairs of points."""
 
 
 class Load(Protocol):
@@ -53,15 +53,15 @@ class Load(Protocol):
 
 @dataclass(frozen=True)
 class Press:
-    """A press by a sphere (lengths in metres); ``share`` is the fraction of the full depth."""
+    """A sphere that presses on the skin (lengths in metres); ``share`` is the fraction of the full depth."""
 
     center_m: tuple[float, float]
     radius_m: float
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the tangential traction acts. The displacement is then that of a contact with friction
-    minus that of a frictionless contact."""
+    """Whether only the tangential traction acts. The result is the displacement with friction minus the
+    displacement without friction."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
         """Return the closed-form solutions to superpose, each with its sign (+1 or −1)."""
@@ -195,7 +195,7 @@ class Skin:
         return np.asarray(self.layout.resistivity_ohm_per_m / (1.0 / path).sum(axis=(2, 3)))
 
     def _finite(self, upper: Float) -> Float:
-        """Return the (U, K) resistances, ohm, with potentials averaged over the rims of finite electrodes."""
+        """Return the (U, K) resistances in ohms; potentials are averaged over the rims of electrodes."""
         radius = self.electrode * self.layout.pitch_m
         rims = []
         for points, turned in ((upper, 0.0), (self.body.lower_m, 0.5)):
@@ -325,7 +325,7 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
     margin: float = 2.0,
     where: Literal["inside", "edge", "half off"] = "inside",
 ) -> Press:
-    """Return a random press by a sphere.
+    """Return a sphere that presses on the skin with random position, radius and friction.
 
     Args:
         rng: Random generator.

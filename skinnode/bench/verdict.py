@@ -1,4 +1,4 @@
-"""Compares solved displacements with the true ones, and assigns a verdict to each wire.
+"""Compares solved displacements with the true displacements, and assigns a verdict to each wire.
 
 Each wire of a frame receives one of three verdicts:
 
@@ -65,12 +65,12 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that a Gaussian error exceeds ± ``deviations`` standard deviations."""
+    """Return the two-sided Gaussian tail probability beyond ``deviations`` standard deviations."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 
 def limit_of(coordinates: int) -> float:
-    """Return the larger of 5 and z(n), where n is ``coordinates``; the module docstring defines z(n)."""
+    """Return the larger of 5 and z(n) for n = ``coordinates``; the module docstring defines z(n)."""
     from scipy.special import ndtri
 
     if coordinates == 0:

@@ -2,7 +2,7 @@
 
 The plan of a bus contains SYNC, the host's heartbeat if enabled, the frames of other devices listed in the
 hand file, and a fraction :data:`SDO_SHARE` of the bandwidth for SDO. Each patch adds the chunks and the
-summary of one scan per SYNC period, and one heartbeat and one EMCY per heartbeat period. The plan leaves out
+summary of one scan per SYNC period, and one heartbeat and one EMCY per heartbeat period. The plan excludes
 the SDO transfers that configure a node when it rejoins the bus: they have a lower priority than PDOs and use
 only spare bandwidth.
 """
@@ -37,8 +37,7 @@ PACE_JITTER_S: Final = 0.2e-3
 machine."""
 
 _SAMPLES: Final = 512
-"""Number of random frames from which the mean frame length is estimated, with a standard error of 0.1
-bits."""
+"""Number of random frames used to estimate the mean frame length, with a standard error of 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,7 @@ class PlannedFrame:
     jitter_s: float
     """Maximum deviation of a frame from its scheduled time, in s."""
     worst_s: float
-    """Duration of a frame with the maximum number of stuff bits, s."""
+    """Duration of a frame with the maximum number of stuff bits, in s."""
     typical_s: float
     """Mean duration of a frame with random data, in s."""
     scans: bool = False
@@ -112,7 +111,7 @@ class BusPlan:
 
     @property
     def load(self) -> float:
-        """Bus load if every frame has the maximum number of stuff bits; 1 is a fully loaded bus."""
+        """Bus load if every frame has the maximum number of stuff bits; 1 means a fully loaded bus."""
         return sum(frame.load for frame in self.frames)
 
     @property
@@ -227,7 +226,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    # The plan contains the frames of one SDO channel, but every node has its own SDO identifiers.
+    # The plan contains the frames of a single SDO channel, but every node has its own SDO identifiers.
     for patch in patches:
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",

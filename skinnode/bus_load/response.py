@@ -38,7 +38,7 @@ class Message:
     spacing_ns: int = 0
     """Minimum time between consecutive frames of a burst, in ns."""
     jitter_ns: int = 0
-    """Maximum queueing jitter of a frame, in ns. The jitter does not change the order of the frames."""
+    """Maximum queueing jitter of a frame, in ns. Jitter does not change the order of the frames."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -76,10 +76,11 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     Args:
         message: the message.
         others: the other messages on the bus.
-        bit_ns: bit time, ns; a frame queued up to one bit time after the start of arbitration can still win.
+        bit_ns: bit time, in ns; a frame queued up to one bit time after the start of arbitration can still
+            win.
 
     Returns:
-        The response time; None if it is unbounded, because this message and those of higher priority need the
+        The response time; None if it is unbounded, because this message and higher-priority messages need the
         entire bandwidth.
     """
     higher = [other for other in others if other.can_id < message.can_id]

@@ -1,7 +1,7 @@
 """Counts the bits of many frames, including stuff bits, for :mod:`skinnode.bus_load.timing`.
 
 The compiled kernels are in :mod:`skinnode.bus_load.stuffing_kernels`, which is imported on first use: a node
-and the simulator of a kernel bus do not count bits, so they need not load numba.
+and the simulator on a kernel CAN bus do not count bits, so they need not load numba.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
 
 @functools.cache
 def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return two arrays: the CRC table, and a table of ``next run << 8 | number of stuff bits``."""
+    """Return two arrays: the CRC table, and a table with entries ``next run << 8 | number of stuff bits``."""
     crc, next_run, stuffed = (np.array(table, np.uint16) for table in tables())
     return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
 
@@ -124,7 +124,7 @@ def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: 
 
 
 def classic_frame_bits(head: int, data: bytes) -> int:
-    """Count the bits of a classic frame with an 11-bit identifier, five times as fast as ``exact_bits``.
+    """Count the bits of a classic frame with an 11-bit identifier; five times as fast as ``exact_bits``.
 
     The first call takes longer, because it loads a kernel.
 

@@ -61,7 +61,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum number of bits in a frame: a stuff bit follows the first 5 bits and every 4 more.
+    """Return the maximum number of bits in a frame: stuff bits after the first 5 bits and every 4 more.
 
     Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -269,7 +269,7 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counts frames and the exact number of bits in them.
+    """Counts frames and their exact number of bits.
 
     Adding a frame is fast, because bits are counted later, for a batch of frames. Instances are not
     thread-safe.
@@ -307,7 +307,7 @@ class BusLoad:
     ) -> None:
         """Add a frame; its bits are counted as in :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
 
-        Until the bits are counted, ``data`` is kept by reference.
+        Only a reference to ``data`` is stored until the bits are counted.
         """
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)

@@ -1,4 +1,4 @@
-"""SDO abort codes (CiA 301 v4.2, table 22), and the exception that carries one."""
+"""SDO abort codes (CiA 301 v4.2, table 22), and an exception that carries an abort code."""
 
 from __future__ import annotations
 

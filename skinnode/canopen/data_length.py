@@ -7,7 +7,7 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""Payload lengths in bytes, by data length code (DLC)."""
+"""Payload lengths in bytes, indexed by data length code (DLC)."""
 
 
 def fd_length(n_bytes: int) -> int:

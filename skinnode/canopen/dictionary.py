@@ -61,10 +61,10 @@ class Entry:
     access: str
     """Access type: ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
     default: Value | None = None
-    """Default value; None if it differs between devices, as for the serial number. The initial value is then
+    """Default value; None if it differs between devices, as the serial number does. The initial value is then
     0."""
     plus_node_id: bool = False
-    """Whether the node-ID is added to the default value, as for a COB-ID."""
+    """Whether the node-ID is added to the default value, as in a COB-ID."""
     mappable: bool = False
     """Whether the entry can be mapped into a PDO."""
     low: int | None = None
@@ -115,7 +115,7 @@ def var(  # noqa: PLR0913 - one argument for each column of the standard's table
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """Declare a VAR or DOMAIN. The arguments are those of :class:`Entry`."""
+    """Declare a VAR or DOMAIN. The arguments are the same as for :class:`Entry`."""
     entry = Entry(index, 0, name, data_type, access, default, plus_node_id, mappable, None, high)
     kind = ObjectType.DOMAIN if data_type is DataType.DOMAIN else ObjectType.VAR
     return Object(index, name, kind, (entry,))
@@ -159,7 +159,7 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
     """Declare an array.
 
     ``labels`` contains the names of the entries from sub-index 1 upwards. ``first`` is described in
-    :func:`record`. The other arguments are those of :class:`Entry`.
+    :func:`record`. The other arguments are the same as for :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

@@ -40,7 +40,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Description of a node, which only a DCF contains."""
+    """Description of a node; contained only in a DCF."""
 
     node_id: int
     bitrate_kbps: int

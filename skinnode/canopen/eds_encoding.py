@@ -23,7 +23,7 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codecs for the bytes in an :class:`EdsText`, by encoding name."""
+"""Python codecs for the bytes in an :class:`EdsText`, keyed by encoding name."""
 
 
 class EdsText(NamedTuple):
@@ -46,15 +46,15 @@ class EdsText(NamedTuple):
 
     @property
     def note(self) -> str:
-        """Note for display if the encoding is not ASCII; otherwise empty."""
+        """Note to display if the encoding is not ASCII; otherwise empty."""
         return "" if self.encoding == ASCII else f"read as {self.encoding}: an EDS should be ASCII"
 
 
 def read_eds_text(data: bytes) -> EdsText:
     """Decode an EDS or DCF file.
 
-    The encoding is given by the byte order mark, which is removed. Without a byte order mark, it is the first
-    of ASCII, UTF-8, Windows-1252 and Latin-1 that can decode the file.
+    If the file has a byte order mark, the mark determines the encoding and is removed. Otherwise, the
+    encoding is the first of ASCII, UTF-8, Windows-1252 and Latin-1 that can decode the file.
 
     Args:
         data: content of the file.
@@ -78,7 +78,7 @@ def read_eds_text(data: bytes) -> EdsText:
 
 
 def octets_text(data: bytes) -> str:
-    """Decode bytes to text in which each non-ASCII byte is a lone surrogate."""
+    """Decode bytes to text in which each non-ASCII byte becomes a lone surrogate."""
     return data.decode("ascii", "surrogateescape")
 
 

@@ -47,7 +47,7 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Convert the exception of an EDS parser to a ProfileError, with the line or section if known."""
+    """Convert an EDS parser's exception to a ProfileError, with the line or section if known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:

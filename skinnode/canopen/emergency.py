@@ -1,6 +1,6 @@
 """Error codes of emergency messages (EMCY), and texts for these codes, the error register and error history.
 
-The codes are those of CiA 301 v4.2, 7.2.7, tables 26 and 48. Patches of this project use some of them in a
+The codes are defined in CiA 301 v4.2, 7.2.7, tables 26 and 48. Patches of this project use some of them in a
 narrower sense. Manufacturer-specific bytes are decoded only if the sender is such a patch.
 """
 
@@ -150,7 +150,7 @@ def history_text(entry: int, *, ours: bool) -> str:
 def says_too_slow(code: int, detail: bytes) -> bool:
     """Return whether an emergency message reports that scans were skipped because of a slow computer or bus.
 
-    Such a message does not indicate a fault of the skin.
+    Such a message does not indicate a fault in the skin.
 
     Args:
         code: error code.
@@ -213,5 +213,5 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that describe the manufacturer-specific bytes from a patch, by error code. They require at least
-two bytes."""
+"""Functions that describe the manufacturer-specific bytes from a patch, keyed by error code. They require at
+least two bytes."""

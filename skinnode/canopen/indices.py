@@ -130,13 +130,13 @@ MAX_PDOS: Final = 512
 """Maximum number of RPDOs; the same limit applies separately to TPDOs. It equals the number of indices in a
 range such as 0x1400 to 0x15FF."""
 PDO_MAPPING_OFFSET: Final = 0x200
-"""Offset from the index of a PDO's communication record to that of its mapping record."""
+"""Offset from the index of a PDO's communication record to the index of its mapping record."""
 PDO_INVALID: Final = 1 << 31
 """COB-ID bit that disables a PDO."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of the communication record of a PDO."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Lengths in bits of the data types that can be mapped into an RPDO as dummies, by data type index.
+"""Lengths in bits of the data types that can be mapped into an RPDO as dummies, keyed by data type index.
 
 A node ignores the bytes of a dummy. BOOLEAN is not supported, because mapped objects must consist of whole
 bytes.

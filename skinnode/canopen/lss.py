@@ -18,8 +18,8 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates in bit/s, by index in the bit timing table of CiA 301. Index 5 is reserved, and index 9 selects
-automatic bit rate detection."""
+"""Bit rates in bit/s, keyed by index in the CiA 301 bit timing table. Index 5 is reserved, and index 9
+selects automatic bit rate detection."""
 
 LSS_DONE: Final = 0
 """Error code of a successful configuration request."""
@@ -28,7 +28,7 @@ LSS_MANUFACTURER_ERROR: Final = 0xFF
 """Error code of a manufacturer-specific error, which the next byte of the response specifies."""
 
 RESET_SCAN: Final = 0x80
-"""Bit number in a fastscan request that restarts the scan at the vendor-ID. Every node without a node-ID
+"""Bit-check value in a fastscan request that restarts the scan at the vendor-ID. Every node without a node-ID
 responds."""
 
 

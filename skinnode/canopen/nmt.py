@@ -31,7 +31,7 @@ GUARD_TOGGLE: Final = 0x80
 
 
 class NmtState(IntEnum):
-    """NMT states, with their values in heartbeats. In this project, switched-off nodes are INITIALISING."""
+    """NMT states, with their values in heartbeats. This project treats switched-off nodes as INITIALISING."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -60,7 +60,7 @@ STATE_NAMES: Final[dict[int, str]] = {
     NmtState.OPERATIONAL: "operational",
     NmtState.PRE_OPERATIONAL: "pre-operational",
 }
-"""Names of the NMT states, for display."""
+"""Display names of the NMT states."""
 
 AFTER_COMMAND: Final = {
     NmtCommand.START: NmtState.OPERATIONAL,

@@ -38,7 +38,7 @@ def find_buses(
     Args:
         interface: Value of ``--interface``.
         channel: Value of ``--channel``.
-        bitrate: Value of ``--bitrate``, bits per second.
+        bitrate: Value of ``--bitrate``, in bits per second.
         fd: Whether ``--fd`` is given.
         hand: Value of ``--hand``.
         bus: Value of ``--bus``.
@@ -81,7 +81,7 @@ def find_bus(
     hand: Path | None,
     bus: str | None,
 ) -> Place:
-    """Return the single bus that the options specify. The arguments are those of :func:`find_buses`.
+    """Return the single bus that the options specify. The arguments are the same as for :func:`find_buses`.
 
     Raises:
         ConfigError: The options are not valid, or they match several buses.
@@ -128,7 +128,7 @@ def find_node(
 ) -> tuple[Place, int]:
     """Return the bus and node-ID of NODE: a node-ID, or the name of a patch on any bus of the hand.
 
-    The other arguments are those of :func:`find_buses`.
+    The other arguments are the same as for :func:`find_buses`.
 
     Raises:
         ConfigError: No patch has this name, or the bus of the node-ID is ambiguous.

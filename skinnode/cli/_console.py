@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width in columns for output to a pipe or file; so large that no line is wrapped."""
+"""Console width in columns for output to a pipe or file; large enough that no line is wrapped."""
 
 
 def print_json(value: Any) -> None:
@@ -80,7 +80,7 @@ def _console_type() -> type[Console]:
 
 
 def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
-    """Create an empty table with a rule below the header; ``right`` names the right-aligned columns."""
+    """Create an empty table with a rule below the header; ``right`` lists the right-aligned columns."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 

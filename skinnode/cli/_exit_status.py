@@ -11,9 +11,10 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-A command stopped by a signal prints nothing, because the signal was sent on purpose. The command closes open
-resources before it exits. SIGHUP stays ignored if it was ignored at the start, as under nohup. This module
-imports only modules that load fast, so that its handlers are installed before other modules are loaded.
+A command stopped by a signal prints nothing, because the signal was sent on purpose. The command releases
+open resources before it exits. SIGHUP remains ignored if it was ignored at startup, as under nohup. This
+module imports only modules that load fast, so that its handlers are installed before other modules are
+loaded.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
     Before the application starts and after it ends, a termination signal ends the process at once.
 
-    BLAS libraries are limited to one thread unless the environment sets another number. BLAS threads
+    BLAS libraries are limited to one thread unless the environment sets a different number. BLAS threads
     busy-wait: under a real-time policy (``chrt -f``), they would occupy every processor and keep all other
     threads of a host from running.
 

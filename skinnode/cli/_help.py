@@ -1,7 +1,7 @@
-"""Formats command help: reflows docstrings, and omits the type beside options that take no value.
+"""Formats command help: reflows docstrings, and omits the type next to options that take no value.
 
 Typer keeps a docstring's line breaks, which then fall in the middle of terminal lines. Typer also prints
-``<bool>`` beside each option that takes no value.
+``<bool>`` next to each option that takes no value.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def running_text(help_text: str | None) -> str | None:
-    """Return a help text with each paragraph on a single line; each list item keeps its own line."""
+    """Return a help text with each paragraph on a single line; each list item remains on its own line."""
     if help_text is None:
         return None
     return re.sub(r"(?<!\n)\n(?!\n|\s*[-*] )", " ", inspect.cleandoc(help_text))

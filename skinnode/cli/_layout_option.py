@@ -1,4 +1,4 @@
-"""Implements the option ``--layout``: the geometry of a patch as a preset, a file or a Python name."""
+"""Implements the ``--layout`` option: the geometry of a patch as a preset, a file or a Python name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as in a hand's layou
 
 
 def import_from_here() -> None:
-    """Allow MODULE:NAME to refer to a file in the working directory, as ``python -m`` does."""
+    """Allow MODULE:NAME to refer to a file in the working directory, as with ``python -m``."""
     sys.path.insert(0, os.getcwd())
 
 

@@ -52,7 +52,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value < math.inf:
-        raise typer.BadParameter(f"{text!r} is not a number of seconds, at least 0")
+        raise typer.BadParameter(f"{text!r} is not a non-negative number of seconds")
     return value
 
 

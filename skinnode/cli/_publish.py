@@ -33,7 +33,7 @@ class AskedPublication:
 
     Args:
         options: Connections; None to publish nothing.
-        commands: Whether programs may command the hand.
+        commands: Whether programs may send commands to the hand.
     """
 
     def __init__(self, options: SessionOptions | None, *, commands: bool) -> None:

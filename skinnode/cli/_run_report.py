@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
 
 _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
-"""Maximum wait at the end of a run for nodes to clear overrun emergencies: 1 s or three SYNC periods,
+"""Maximum time to wait at the end of a run for nodes to clear overrun emergencies: 1 s or three SYNC periods,
 whichever is longer."""
 
 _POLL_S = 0.01
@@ -144,7 +144,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Describe the measured noise and the noise stated in the hand file, or "" if they agree."""
+    """Describe the measured noise and the noise stated in the hand file; "" if they agree."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -153,7 +153,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why the patch is faulty or refused, or "" in any other condition."""
+    """Return ``before`` and then the reason why the patch is faulty or refused; "" in other conditions."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -306,7 +306,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Describe a field's imprecision and the number of faults in its readings, or "" if none."""
+    """Describe a field's imprecision and the number of faults in its readings; "" if it has neither."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} in the readings; the affected readings are excluded"

@@ -61,7 +61,7 @@ class WatchedSource(NamedTuple):
     hand: HandConfig
     name: str
     wall_minus_mono_ns: int
-    """Wall-clock time minus the time on the monotonic clock of the source, in ns."""
+    """Wall-clock time minus the source's monotonic time, in ns."""
     start: Callable[[ExitStack, threading.Event, Callable[[str], None]], Source]
     """Function that starts the source. Closing the stack also closes the source; the event cancels the start;
     the last argument displays the current step. Raises the same errors as :meth:`Host.from_config`."""
@@ -73,7 +73,7 @@ def check_options(options: WatchOptions) -> None:
 
     sources = {
         "HAND.toml": options.hand is not None,
-        "--simulate": options.simulate and options.hand is None,  # with a hand, both are one source
+        "--simulate": options.simulate and options.hand is None,  # HAND.toml --simulate is one source
         "--replay": options.replay is not None,
         "--remote": options.remote is not None,
     }
@@ -88,7 +88,7 @@ def check_options(options: WatchOptions) -> None:
     unused = "--simulate" if options.simulate else given[0] if options.hand is None else None
     for option, value in (("--interface", options.interface), ("--channel", options.channel)):
         if value is not None and unused is not None:
-            raise ConfigError(option, value, f"only without {unused}, which opens no bus of a hand")
+            raise ConfigError(option, value, f"only without {unused}, which does not open a hand's buses")
 
 
 @contextmanager

@@ -19,7 +19,9 @@ ZenohConfig = Annotated[
 ]
 ZenohPort = Annotated[
     int | None,
-    typer.Option(help="First of the 16 ports of daemons on this machine; default 17447.", metavar="PORT"),
+    typer.Option(
+        help="First of the 16 ports used by daemons on this machine; default 17447.", metavar="PORT"
+    ),
 ]
 
 
@@ -32,7 +34,7 @@ class ZenohOptions(NamedTuple):
     listen: str | None = None
 
     def require_unused(self, allowed: str) -> None:
-        """Raise ConfigError, which names ``allowed``, if an option is given."""
+        """Raise ConfigError if an option is given; ``allowed`` states when it is allowed."""
         from skinnode.errors import ConfigError
 
         for name, value in self._asdict().items():

@@ -40,7 +40,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
         "The times of F + J and of steps are for one wire. A step includes evaluations of F and J. The\n"
-        "trust radius is so short that every operator must shorten its step. skinnode, LAPACK and BLAS use\n"
+        "trust radius is so small that every operator must shorten its step. skinnode, LAPACK and BLAS use\n"
         "one thread."
     )
     _write(json, figures)
@@ -117,7 +117,7 @@ def stability(
 @app.command()
 def trust(
     json: JsonFile = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for the random numbers.")] = 1,
     short: Annotated[
         bool,
         typer.Option("--short", help="Measure only one layout at two noise levels, and 20 pairs of faults."),
@@ -193,9 +193,9 @@ def accuracy(
         ),
     ] = None,
     prior: Annotated[
-        Literal["cells", "discs"], typer.Option(help="Prior of the loads in the part `past`.")
+        Literal["cells", "discs"], typer.Option(help="Prior for the loads in the part `past`.")
     ] = "cells",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the part `detection`.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for the part `detection`.")] = 1,
     presses: Annotated[
         int, typer.Option(min=1, help="Number of presses per row of the part `detection`.")
     ] = 200,
@@ -207,9 +207,9 @@ def accuracy(
 
     The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
     `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
-    false alarms occur. With `--only past`, it measures what earlier frames contribute to an estimate. The
-    exit status is 1 if a requirement is not met. No requirement limits a time, because times depend on the
-    machine.
+    false alarms occur. With `--only past`, it measures how much earlier frames improve an estimate. The
+    exit status is 1 if a requirement is not met. There are no requirements on times, because times depend on
+    the machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)
@@ -219,7 +219,7 @@ def accuracy(
     _prepare(json, plot)
     if only is not None:
         if plot is not None:
-            raise typer.BadParameter(f"got --plot, which --only {only} cannot draw", param_hint="--plot")
+            raise typer.BadParameter(f"got --plot, but --only {only} has no plot", param_hint="--plot")
         if only == "families":
             figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
         else:
@@ -262,7 +262,7 @@ def path(
         int, typer.Option(min=1, help="Number of random presses per layout and press depth.")
     ] = 10,
 ) -> None:
-    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper; print the paper's values alongside."""
+    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper; print the paper's values beside them."""
     from skinnode.bench import path as bench
     from skinnode.text.json_values import plain
 
@@ -294,12 +294,12 @@ def scale(
         typer.Option(
             min=0.0,
             max=3600.0,
-            help="Duration of each measurement in real time on udp_multicast, s; 0 to skip them.",
+            help="Duration of each measurement in real time on udp_multicast, in s; 0 skips them.",
             metavar="S",
         ),
     ] = 10.0,
 ) -> None:
-    """Measure how the CPU time and memory of the simulator and host grow with skin area and touched area.
+    """Measure how the CPU time and memory of the simulator and the host grow with skin area and touched area.
 
     Hands run in virtual time, except for the measurements on udp_multicast. By default, the largest hand has
     1,000 patches, and the benchmark takes several minutes.
@@ -360,7 +360,7 @@ def _print_real_time(figures: dict[str, Any]) -> None:
 def node(
     json: JsonFile = None,
     seconds: Annotated[
-        float, typer.Option(min=0.2, max=3600.0, help="Duration of each measurement on the bus, s.")
+        float, typer.Option(min=0.2, max=3600.0, help="Duration of each measurement on the bus, in s.")
     ] = 10.0,
     rounds: Rounds = 31,
     interface: Annotated[
@@ -399,10 +399,10 @@ def node(
 def pipeline(
     json: JsonFile = None,
     plot: PlotFile = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Duration of each measurement, s.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of each measurement, in s.")] = 10.0,
     short: Annotated[bool, typer.Option("--short", help="Run only rows that have a requirement.")] = False,
     interface: Annotated[
-        str, typer.Option(help="udp, or socketcan for the one bus given by --channel.")
+        str, typer.Option(help="udp, or socketcan for the single bus given by --channel.")
     ] = "udp",
     channel: Annotated[str, typer.Option(help="Channel for socketcan.")] = "vcan0",
     all_cores: Annotated[
@@ -447,10 +447,10 @@ def recording(
     buses: Annotated[int, typer.Option(min=1, max=8, help="Number of full buses, four patches each.")] = 4,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of each recording in minutes.")] = 1.0,
     block: Annotated[
-        float, typer.Option(min=1, help="Duration of the simulated traffic, which is repeated, s.")
+        float, typer.Option(min=1, help="Duration of the simulated traffic, in s; the traffic is repeated.")
     ] = 5.0,
 ) -> None:
-    """Write recordings of fully loaded buses; measure their size, write cost and MCAP seek time."""
+    """Write recordings of fully loaded buses; measure their size, cost of writing and MCAP seek time."""
     from skinnode.bench import recording as bench
     from skinnode.messages.typestore import require_mcap
 
@@ -483,7 +483,7 @@ def recording(
 @app.command()
 def remote(
     json: JsonFile = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Duration, s.")] = 60.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration, in s.")] = 60.0,
     publish_only: Annotated[
         bool, typer.Option("--publish-only", help="Measure the host without a second process or pings.")
     ] = False,
@@ -512,7 +512,7 @@ def soak(
     json: JsonFile = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak test in minutes.")] = 10.0,
     seed: Annotated[
-        int, typer.Option(help="Seed of the faults; the same seed reproduces the same rounds.")
+        int, typer.Option(help="Seed for the faults; the same seed reproduces the same rounds.")
     ] = 1,
     own_cache: Annotated[
         bool, typer.Option(hidden=True, help="Run in this process, with the existing kernel cache.")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _RRD = ".rrd"
 _EXAGGERATION = 10.0
-"""Factor by which displacements are enlarged in drawings, as in ``skinnode view``."""
+"""Factor by which drawings enlarge displacements, as in ``skinnode view``."""
 
 
 def convert(
@@ -105,5 +105,5 @@ def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
     except BaseException:
         target.unlink(missing_ok=True)
         raise
-    lost = f"{target.name} cannot contain frames and the journal; it cannot be converted back to a recording"
+    lost = f"{target.name} cannot contain frames or the journal; it cannot be converted back to a recording"
     return Conversion(0, done.counts.drawn, tuple(done.replay.flaws), (*done.replay.notes, lost))

@@ -16,14 +16,14 @@ __getattr__ = moved("skinnode.cli.demo", "skinnode.demo.hand")
 
 def demo(
     seconds: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="Duration of pressing and sliding, s.", metavar="S")
+        float, typer.Option(min=1.0, max=3600.0, help="Duration of pressing and sliding, in s.", metavar="S")
     ] = 8.0,
     patches: Annotated[
         int,
         typer.Option(min=1, max=MAX_PATCHES, help="Number of patches of 10 × 10 electrodes.", metavar="N"),
     ] = 4,
     seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the scene and the converter noise.", metavar="N")
+        int, typer.Option(min=0, help="Seed for the scene and the converter noise.", metavar="N")
     ] = 1,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write all results to this file.", metavar="FILE")
@@ -40,7 +40,7 @@ def demo(
     Each patch is a CANopen node on a virtual bus inside this process. A spherical indenter presses and
     slides; the host collects the PDOs and solves the scans. The exit status is 1 if a scan was torn, a frame
     was lost, or errors exceed the reported uncertainty. The limit for the RMS error is 1.15 times the
-    reported RMS standard deviation. The limit for the error of a coordinate is 6 standard deviations.
+    reported RMS standard deviation. The limit for a coordinate error is 6 standard deviations.
     """
     import json
 

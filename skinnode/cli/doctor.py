@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: finds faults, and prints the certainty and the remedy for each fault."""
+"""``skinnode doctor [HAND.toml]``: finds faults, and prints a certainty and a remedy for each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skinnode eds``: EDS or DCF of a patch of any size for another CANopen master, and C99 for firmware."""
+"""``skinnode eds``: generates a patch's EDS or DCF for another CANopen master, and C99 code for firmware."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def eds(
         int | None, typer.Option(min=1, max=255, help="Number of electrodes per lower wire, M; default 10.")
     ] = None,
     layout: Annotated[
-        str | None, typer.Option(help=f"Take the sizes from a layout: {LAYOUT_HELP}", metavar="LAYOUT")
+        str | None, typer.Option(help=f"Use the sizes of a layout: {LAYOUT_HELP}", metavar="LAYOUT")
     ] = None,
     code_bits: Annotated[
         int, typer.Option(help="Width of a resistance code in bits: 16 or 24.", metavar="16|24")
@@ -58,7 +58,7 @@ def eds(
         Path | None,
         typer.Option(
             "--c",
-            help="Write the C99 kit of the patch, for a board or a foreign master, into this folder.",
+            help="Write the C99 kit of the patch, for a board or another master, into this folder.",
             metavar="FOLDER",
         ),
     ] = None,
@@ -104,7 +104,7 @@ def eds(
 
 
 def _refuse_with_kit(others: dict[str, object]) -> None:
-    """Refuse options that have no effect with --c; ``others`` contains their values, None if not given."""
+    """Refuse options that have no effect with --c; ``others`` contains their values, or None if not given."""
     from skinnode.errors import ConfigError
 
     for option, value in others.items():

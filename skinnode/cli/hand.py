@@ -183,7 +183,7 @@ def _frame_table(plan: BusPlan) -> Table:
 
 
 def _other_table(plan: BusPlan) -> Table:
-    """Return a table with the longest time that each frame of another device waits for the bus."""
+    """Return a table of the longest time that each frame of another device waits for the bus."""
     table = _table("others", "bytes", "every ms", "queued to sent ms")
     for frame in plan.others:
         worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"
@@ -223,7 +223,7 @@ def ros2(
     """Write two ROS 2 packages: the buses of a hand for ros2_canopen, and the messages skinnode_msgs.
 
     The first package contains a bus.yml, the EDS files and a launch file for each bus. An existing file with
-    other content is not overwritten. No bus is opened.
+    different content is not overwritten. No bus is opened.
     """
     from skinnode.config import load_hand
     from skinnode.messages import message_package, ros2_canopen
@@ -239,12 +239,12 @@ def ros2(
     masters = [bus.name for bus in config.buses if bus.role == "master"]
     if masters:
         typer.echo(
-            f'note: {", ".join(masters)}: the host must be a guest beside ros2_canopen (role = "guest")'
+            f'note: {", ".join(masters)}: the host must be a guest alongside ros2_canopen (role = "guest")'
         )
 
 
 def _write_new(texts: dict[Path, str], folder: Path) -> None:
-    """Write files below an existing folder, unless one of them exists with other content."""
+    """Write files into an existing folder, unless one of them already exists with different content."""
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import write_text
 
@@ -254,7 +254,7 @@ def _write_new(texts: dict[Path, str], folder: Path) -> None:
         for file, text in texts.items():
             if file.exists() and file.read_bytes() != text.encode():
                 raise ConfigError(
-                    "--output", str(file), "no such file, or one with the same content; remove it"
+                    "--output", str(file), "a new file, or a file with the same content; remove it first"
                 )
             file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -270,7 +270,7 @@ def new(
         int, typer.Option(min=1, max=16, help="Number of buses that share the patches.", metavar="N")
     ] = 1,
 ) -> None:
-    """Print a commented hand file as a starting point. Its SYNC period suits the bus load.
+    """Print a commented hand file as a starting point. Its SYNC period is chosen to suit the bus load.
 
     The patches are divided evenly among the buses, in the order of their node-IDs.
     """
@@ -316,7 +316,7 @@ period_ms = {period_ms}                    # each SYNC starts one scan of every 
 [solver]
 method = "auto"                   # every field has contacts with forces: field.contacts, HandFrame.contacts
 # max_std_m = 20e-6               # field.precise: maximum standard deviation of a displacement, in metres,
-# max_force_std_n = 0.1           # and of a contact's normal force; default: limits that a sound patch meets
+# max_force_std_n = 0.1           # and of a contact's normal force; default: limits a healthy patch meets
 
 [stream]
 partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"

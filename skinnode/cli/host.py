@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skinnode.host.events import EventSubscription
 
 _LONGEST_WAIT_S = 0.1
-"""Maximum delay before the command reacts to Ctrl-C, s."""
+"""Maximum delay before the command reacts to Ctrl-C, in s."""
 
 
 def host(
@@ -39,12 +39,12 @@ def host(
         typer.Option(
             "--zenoh-port",
             "--port",
-            help="First of the 16 ports of daemons on this machine; default 17447.",
+            help="First of the 16 ports used by daemons on this machine; default 17447.",
             metavar="PORT",
         ),
     ] = None,
 ) -> None:
-    """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
+    """Bring up a hand's patches as the CANopen manager, compute displacement fields and report every second.
 
     Onsets and releases of touches are reported when they happen. With --json, each patch has `touched`,
     `touch_odds` and `contacts` (null before the first field): centroid, area, normal and shear force with
@@ -109,7 +109,7 @@ def _run(
 
 
 def _note_touches(events: EventSubscription, report: Report) -> None:
-    """Report the onsets and releases since the last call."""
+    """Report the onsets and releases since the previous call."""
     while (event := events.get(0.0)) is not None:
         if event.what in ("touched", "released"):
             report.note(str(event))

@@ -1,4 +1,4 @@
-"""``skinnode info NODE``: shows all information about one node on one screen."""
+"""``skinnode info NODE``: shows all information about a node on one screen."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def info(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Print identity, layout, baseline, errors, PDOs, wires and configuration of one node.
+    """Print the identity, layout, baseline, errors, PDOs, wires and configuration of one node.
 
     The command only reads. The exit status is 0 if the node reports no fault, and 1 if the node has an error,
     faulty wires or no baseline. The exit status is 2 if the node does not answer.

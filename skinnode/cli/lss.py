@@ -98,7 +98,7 @@ def set_node(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Set and store the node-ID, the bit rate or both in one node.
+    """Set and store the node-ID of one node, its bit rate, or both.
 
     A node that already has a node-ID is reset, so that the new node-ID takes effect. The exit status is 0 on
     success, 1 if the node did not store its settings or did not boot, 2 if the command could not run.

@@ -60,7 +60,7 @@ def monitor(
     The command runs the hand as `skinnode host` does, but waits for missing patches. With --remote, it shows
     a hand that another process runs. Keys: 1-9 select a patch, z shows only the selected patch, t tares the
     selected patch, n resets its node, r records, space freezes the picture, ? shows help, q quits. The screen
-    requires the optional packages of the extra `tui`. The exit status is 0 if no fault occurred, 1 if any
+    requires the optional packages of the `tui` extra. The exit status is 0 if no fault occurred, 1 if any
     fault occurred (faults are printed at the end), 2 if the monitor could not run.
     """
     from skinnode.cli._console import progress

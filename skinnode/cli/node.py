@@ -163,7 +163,7 @@ def _memory(store: Path | None) -> Iterator[FileMemory | None]:
 
 
 def _node_text(node_id: int, given: int | None) -> str:
-    """Return the node-ID in use as text; a node-ID stored by LSS takes priority over --node-id."""
+    """Return the node-ID in use as text; a node-ID stored by LSS takes precedence over --node-id."""
     from skinnode.canopen.lss import NOT_CONFIGURED
 
     who = "node without a node-ID" if node_id == NOT_CONFIGURED else f"node {node_id}"

@@ -132,7 +132,7 @@ def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
 
 
 def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
-    """Read the whole dictionary: the objects in the EDS or, without an EDS, those defined by CiA 301."""
+    """Read the whole dictionary: the objects in the EDS or, without an EDS, the CiA 301 objects."""
     from skinnode.diagnose.object_dictionary import dump, dump_standard
 
     return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
@@ -184,7 +184,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
     """Read the objects.
 
-    A refused read raises SdoAbort if only one object is read; otherwise, it is listed with the results.
+    A refused read raises SdoAbort if only one object is read; otherwise, it is listed among the results.
     """
     from skinnode.diagnose.object_dictionary import read_entry
 

@@ -52,11 +52,11 @@ def record(
     """Run a hand's patches as `skinnode host` does, and record every frame received or sent.
 
     Play the recording with `skinnode replay`; can-utils and python-can can read it too. An MCAP file also
-    contains the fields, contacts, health and events as ROS 2 messages. If the command is
-    killed, at most the last second of the recording is lost. A recording made with --listen contains no
-    baselines. To compute its fields, replay a copy of the log without the journal with --hand. The exit
-    status is 1 if frames could not be written or if a fault occurred that `skinnode host` would report, and 2
-    if the hand could not be run.
+    contains the fields, contacts, health and events as ROS 2 messages. If the command is killed, at most the
+    last second of the recording is lost. A recording made with --listen contains no baselines. To compute its
+    fields, copy the log without its journal and replay the copy with --hand. The exit status is 1 if frames
+    could not be written or if a fault occurred that `skinnode host` would report, and 2 if the hand could not
+    be run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal

@@ -70,9 +70,9 @@ def resolve(
     """Solve recordings again, with other options or calibrations, and compare the results.
 
     The results are bit-identical to a replay with these options, regardless of the number of processes. The
-    fields of each recording are written to one file, in the same format as by `skinnode convert`. If an
-    option has several values, every combination is solved, and a table compares the results. To resume after
-    an interruption, run the same command again; lost workers do not affect the results.
+    fields of each recording are written to one file, in the same format as the output of `skinnode convert`.
+    If an option has several values, every combination is solved, and a table compares the results. To resume
+    after an interruption, run the same command again; lost workers do not affect the results.
 
     The exit status is 1 if a recording is damaged or incomplete or lacks frames, and 2 if the command could
     not run.
@@ -101,7 +101,7 @@ def resolve(
 
 
 def _check(kind: str, processes: int | None, scheduler: str | None) -> None:
-    """Check in advance that the options are compatible and that the required packages are installed."""
+    """Check that the options are compatible and that the required packages are installed."""
     from skinnode.errors import ConfigError
     from skinnode.messages.typestore import require_mcap
     from skinnode.record.parquet_file import require_pyarrow

@@ -24,7 +24,7 @@ def scan(
 ) -> None:
     """Find every node on a bus: by SDO, by heartbeat, and by LSS if it has no node-ID.
 
-    With --hand, the command scans every bus of the hand. The command changes nothing on any node and takes
+    With --hand, the command scans every bus of the hand. The command changes nothing on the nodes and takes
     two seconds per bus. The exit status is 0 if nodes were found and none of them has a fault. The exit
     status is 1 if no node was found, if two nodes share a node-ID, or if a node of the hand is missing or is
     a different device. The exit status is 2 if the scan could not run.
@@ -86,7 +86,7 @@ def _faults(found: Discovery, place: Place) -> list[str]:
 
 
 def _as_json(scans: list[tuple[Place, Discovery]], faults: list[str]) -> dict[str, object]:
-    """Return the scan results as JSON-compatible data; each node's entry contains the name of its bus."""
+    """Return the scan results as JSON-compatible data; each node's entry includes the name of its bus."""
     from dataclasses import asdict
 
     first = scans[0][0].bus

@@ -52,7 +52,7 @@ def tare(
     elif hand is not None:
         found = [(place, patch.node_id) for place in places for patch in place.patches]
     else:
-        raise ConfigError("PATCH", NOTHING, "names of patches or node-IDs, or --hand for all its patches")
+        raise ConfigError("PATCH", NOTHING, "names of patches or node-IDs, or --hand for a whole hand")
     wanted = list(dict.fromkeys((place.bus.name, node_id) for place, node_id in found))
     with progress(as_json) as tell:
         done = [

@@ -151,7 +151,7 @@ def _open(stack: ExitStack, options: OutputOptions) -> Output:
 
 
 def _watch(options: WatchOptions, drawing: _Drawing) -> tuple[list[str], DrawnCounts] | None:
-    """Draw a hand until drawing stops; return the faults and field counts, None if the start is cancelled."""
+    """Draw a hand until drawing stops; return the faults and field counts, or None if cancelled."""
     from skinnode.cli._console import progress
     from skinnode.host import BringUpCancelled
     from skinnode.process.signals import stop_on_signal
@@ -200,7 +200,7 @@ def _show(
 def _wait(
     source: Source, output: Output, thread: DrawingThread, stop: threading.Event, seconds: float | None
 ) -> None:
-    """Wait until the user, the time limit, the viewer, an error or the end of the recording stops drawing."""
+    """Wait until the user, the time limit, the viewer, an error or the recording's end stops the drawing."""
     import time
 
     end_s = None if seconds is None else time.monotonic() + seconds

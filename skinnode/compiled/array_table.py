@@ -1,6 +1,6 @@
 """Tables that pass many arrays and numbers to a kernel in one argument.
 
-Numba checks and unpacks every argument of every call, which takes 4 to 40 µs for the fifty arrays of a patch.
+Numba checks and unpacks every argument on every call, which takes 4 to 40 µs for the fifty arrays of a patch.
 An :class:`ArrayTable` passes a single array that contains the addresses and shapes of all arrays. A subclass
 declares the fields once, for Python and for kernels:
 
@@ -72,7 +72,7 @@ class _Field:
         return kind if self.axes is None else types.Array(kind, len(self.axes), "C", readonly=self.readonly)
 
     def check(self, table: str, array: Any, lengths: dict[str, int]) -> None:
-        """Raise TypeError unless ``array`` matches the declaration and the known axis ``lengths``."""
+        """Raise TypeError unless ``array`` matches the declaration and the axis ``lengths`` known so far."""
         assert self.axes is not None
         if not isinstance(array, np.ndarray):
             raise TypeError(f"{table}.{self.name}: got {type(array).__name__}, {self._wanted()}")
@@ -218,9 +218,9 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
     """Return a function that kernels use to access the fields of a table by name.
 
-    The function can only be called in compiled code. It raises TypeError if the table does not belong to
-    ``made_of``. Each access to a field reads the table again, so access fields outside loops. In kernels,
-    bool arrays have the element type uint8.
+    The function can only be called in compiled code. It raises TypeError if the table is not a ``made_of``.
+    Each field access reads the table again, so access fields outside loops. In kernels, bool arrays have the
+    element type uint8.
     """
     view, digest = _ViewType(made_of), made_of._digest
     message = f"table: got a table of another class, must be the table of a {made_of.__name__}"

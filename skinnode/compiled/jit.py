@@ -73,7 +73,7 @@ def cache_dir() -> Path | None:
 def is_cold(kernel: str = "solve_patch") -> bool:
     """Return whether ``kernel`` is missing from the cache and will be compiled on its first call.
 
-    Commands announce the slow start in this case.
+    In this case, commands print a notice that the start will be slow.
     """
     folder = cache_dir()
     return folder is None or not any(folder.glob(f"*.{kernel}-*{SUFFIX}"))
@@ -94,7 +94,7 @@ def njit_part(function: _F) -> _F:
 def njit_body(function: _F) -> _F:
     """Inline ``function`` into the kernel that calls it; for functions with a single caller.
 
-    Separate compilation and linking would take 50 % longer.
+    Compiling and linking it separately would take 50 % longer.
     """
     compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
     return compiled
@@ -108,8 +108,8 @@ def njit(function: _F) -> _F:
 def njit_brief(function: _F) -> _F:
     """Compile ``function`` like :func:`njit`, but keep the interpreter lock (GIL) while it runs.
 
-    This decorator is for kernels that take about a microsecond. Acquiring the lock again after such a kernel
-    could take much longer than the kernel itself.
+    This decorator is for kernels that run for about a microsecond. Acquiring the lock again after such a
+    kernel could take much longer than the kernel itself.
     """
     return _kept(function, nogil=False)
 

@@ -2,10 +2,10 @@
 
 Numba's own cache has two weaknesses. It loads any file that it finds: a truncated file causes an exception in
 every run, and damaged machine code is executed. Moreover, all signatures of a function share one index file,
-so two processes that compile different signatures at the same time can mix up their code.
+so two processes that compile different signatures at the same time may load each other's code.
 
 This cache has a separate file for each compiled signature. The file contains a magic number, the SHA-256 of
-the payload, and the payload. Its name contains a digest of all inputs of the compilation, so that no index is
+the payload, and the payload. Its name contains a digest of all inputs to the compilation, so that no index is
 needed. Files are replaced atomically. A file that fails the check is removed, and the kernel is compiled
 again. The removal of a file, or a failure to write one, is logged in one line; no exception reaches the
 caller.
@@ -66,7 +66,7 @@ class KernelCache:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the compiled code for ``signature``; None if there is no usable file.
+        """Return the compiled code for ``signature``; None if there is no usable cache file.
 
         Numba's own cache first calls ``target_context.refresh()``. This loads modules that only the compiler
         needs, including scipy.linalg, and takes 0.2 s in every process. The compiler calls ``refresh()``
@@ -87,7 +87,7 @@ class KernelCache:
                 if kept_signature == signature
                 else None
             )
-        except Exception as error:  # intact, but written by another installation
+        except Exception as error:  # intact, but written by a different installation
             if _remove(path):
                 _report(
                     self._folder, f"a file could not be loaded ({error!r:.200}) and was removed; recompiling"

@@ -4,8 +4,8 @@ Automatic vectorisation falls short in several ways: LLVM prefers 256-bit vector
 are twice as fast, vectorises only if it can prove that arrays do not overlap, and may keep sums in memory
 instead of registers. With this module, a kernel specifies its vector operations explicitly. Each lane
 accumulates its own sum in the order of the source code, so the result does not depend on the number of
-threads or on how columns are distributed. On processors whose vectors hold fewer than LANES doubles, LLVM
-splits each operation.
+threads or on how columns are distributed. On processors with vectors of fewer than LANES doubles, LLVM splits
+each operation.
 
 Vectors support +, − and *. A double in such an expression is broadcast to all lanes.
 """

@@ -7,13 +7,14 @@
          -> HandConfig, or explain (one-line errors)
 
 :func:`load_hand` reads a file, and :func:`parse_hand` validates a table in memory. Both raise
-:class:`~skinnode.errors.ConfigError` with a one-line message that gives the file, line and column, dotted
+:class:`~skinnode.errors.ConfigError` with a one-line message that contains the file, line and column, dotted
 key, value found and values allowed. Values must have the right TOML type, because they are not converted:
 ``node_id = "3"`` is an error.
 
 ``schema`` generates the JSON Schema. ``descriptions`` reads the descriptions of keys from the source code.
 
-The suffix of a key gives the unit. A key without such a suffix contains a count, a ratio or a name.
+The suffix of a key indicates the unit. The value of a key without such a suffix is a count, a ratio or a
+name.
 """
 
 from skinnode.config.buses import (

@@ -35,7 +35,7 @@ class OtherFrame(Table):
     period_ms: Annotated[
         float, Field(ge=0.1, le=3_600_000, allow_inf_nan=False), Allowed("a number from 0.1 to 3600000")
     ]
-    """Minimum time between two frames with this identifier, milliseconds."""
+    """Minimum time between two frames with this identifier, in milliseconds."""
 
 
 class BusConfig(Table):
@@ -53,23 +53,23 @@ class BusConfig(Table):
         Field(ge=10_000, le=1_000_000),
         Allowed("an integer from 10000 to 1000000, as in classic CAN"),
     ] = 1_000_000
-    """Bit rate, bits per second; for CAN FD frames, the bit rate of the arbitration phase."""
+    """Bit rate, in bits per second; for CAN FD frames, the bit rate of the arbitration phase."""
     fd: bool = False
     """Send the PDOs of the patches on this bus in CAN FD frames with bit-rate switching."""
     data_bitrate_bps: Annotated[
         int, Field(ge=10_000, le=8_000_000), Allowed("an integer from 10000 to 8000000")
     ] = 5_000_000
-    """Bit rate of the data phase of CAN FD frames, from ESI to the CRC delimiter, bits per second."""
+    """Bit rate of the data phase of CAN FD frames, from ESI to the CRC delimiter, in bits per second."""
     options: dict[str, bool | int | float | str] = Field(default={})
     """Additional keyword arguments for the interface in python-can."""
     role: Annotated[Role, one_of(Role)] = "master"
     """Role of the host: ``master`` if it sends NMT commands and SYNC on the bus, ``guest`` if the robot's own
     master does."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
-    """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
-    the patches and read their data."""
+    """Frames that the host may send as a guest: ``nothing``, or ``sdo`` for requests that identify and
+    configure the patches and read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
-    """Node-ID of the heartbeat that the host sends as master. The patches monitor this heartbeat and enter
+    """Node-ID in the heartbeat that the host sends as master. The patches monitor this heartbeat and enter
     pre-operational when it stops. If None, the host sends no heartbeat."""
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number greater than 0 and at most 1")
@@ -93,7 +93,7 @@ class SyncConfig(Table):
     """SYNC, sent by the host or by the robot's own master; each SYNC starts one scan of every patch."""
 
     period_ms: Annotated[int, Field(ge=1, le=60_000), Allowed("an integer from 1 to 60000")] = 80
-    """SYNC period, milliseconds."""
+    """SYNC period, in milliseconds."""
     counter_overflow: Annotated[
         int,
         Field(ge=0, le=240),
@@ -101,9 +101,9 @@ class SyncConfig(Table):
     ] = 240
     """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. The value must be
     0 if another master sends SYNC without a counter; each patch then numbers its own scans."""
-    stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a delay of at least 0 ms")] = 0.0
-    """Delay between the SYNCs on successive buses of which the host is the master, milliseconds. With a delay
-    of 0, the scans on all buses end at the same time, and some must wait for a solver."""
+    stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a non-negative delay")] = 0.0
+    """Delay, in milliseconds, between the SYNCs on successive buses on which the host is the master. With a
+    delay of 0, the scans on all buses end at the same time, and some must wait for a solver."""
 
     @property
     def stagger_s(self) -> float:
@@ -117,15 +117,15 @@ class SyncConfig(Table):
 
 
 class BringUpConfig(Table):
-    """Settings for bringing up patches, at start-up and later."""
+    """Settings for bringing up patches, both at start-up and later."""
 
     missing: Annotated[Missing, one_of(Missing)] = "refuse"
-    """Action if a patch does not answer at start-up. With ``refuse``, the host does not start the hand. With
-    ``wait``, the host starts the other patches and waits for the missing patch."""
+    """Action taken if a patch does not answer at start-up. With ``refuse``, the host does not start the hand.
+    With ``wait``, the host starts the other patches and waits for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host writes this period to the nodes; a guest that
-    sends nothing assumes that they already use it. With a period of 250 ms, a lost node is detected within a
-    second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
+    """Heartbeat period of the nodes, in milliseconds. The host writes this period to the nodes; a guest that
+    sends nothing assumes that the nodes already use it. With a period of 250 ms, a lost node is detected
+    within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
 
     @property
     def heartbeat_s(self) -> float:

@@ -1,7 +1,7 @@
 """Descriptions of the keys of a hand file, for its JSON Schema and for the documentation.
 
 The description of a key is the docstring below it in the source code. Pydantic's own option
-``use_attribute_docstrings`` would parse the source code of all tables each time a command starts.
+``use_attribute_docstrings`` would parse the source code of all tables every time a command starts.
 """
 
 from __future__ import annotations

@@ -103,6 +103,6 @@ def tables_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Return the texts of all :class:`Allowed` marks in a type, including the members of a union."""
+    """Return the texts of all :class:`Allowed` annotations in a type, including the members of a union."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]

@@ -22,8 +22,8 @@ from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
 MOST_BUSES: Final = 256
-"""Maximum number of buses in a hand. No machine has that many CAN interfaces, but simulated hands with 1000
-patches have 250 buses."""
+"""Maximum number of buses in a hand. No machine has that many CAN interfaces, but a simulated hand with 1000
+patches has 250 buses."""
 
 
 class HandConfig(Table):

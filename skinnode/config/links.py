@@ -25,19 +25,19 @@ class PoseConfig(Table):
     """
 
     position_m: Annotated[
-        tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
+        tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z] in metres")
     ] = (0.0, 0.0, 0.0)
     """Origin of the frame in its parent frame, in metres."""
     quaternion_xyzw: Annotated[
         tuple[_Part, _Part, _Part, _Part] | None,
         Field(strict=False),
-        Allowed("four numbers [x, y, z, w] of unit length"),
+        Allowed("a unit quaternion [x, y, z, w]"),
     ] = None
     """Orientation as a unit quaternion, real part last."""
     rpy_rad: Annotated[
         tuple[_Angle, _Angle, _Angle] | None,
         Field(strict=False),
-        Allowed("three numbers [roll, pitch, yaw], radians"),
+        Allowed("three numbers [roll, pitch, yaw] in radians"),
     ] = None
     """Roll, pitch and yaw (radians) about the fixed axes x, y and z, as in URDF."""
 
@@ -60,7 +60,7 @@ class PoseConfig(Table):
 
 
 class LinkConfig(Table):
-    """Link of the robot on which patches are mounted."""
+    """Robot link on which patches are mounted."""
 
     name: Name
     """Name of the link, used in the key ``link`` of each patch."""

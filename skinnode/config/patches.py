@@ -40,7 +40,7 @@ _Noise = Annotated[
 _RUBBER = Rubber()
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
 _Tolerance = Annotated[
-    float, Field(ge=0, lt=0.5, allow_inf_nan=False), Allowed("a number of at least 0 and below 0.5")
+    float, Field(ge=0, lt=0.5, allow_inf_nan=False), Allowed("a non-negative number below 0.5")
 ]
 _Position = Annotated[tuple[float, float, float], Field(strict=False)]
 _Wire = Annotated[tuple[_Position, ...], Field(strict=False)]
@@ -58,11 +58,11 @@ class ElectrodesConfig(Table):
     """Contents of a layout file. Recordings contain layout files in this form; a hand file names the file."""
 
     upper_m: _Wires
-    """Positions of the upper electrodes at rest, metres: x, y and z of each electrode of each wire."""
+    """Positions of the upper electrodes at rest, in metres: x, y and z of each electrode of each wire."""
     lower_m: _Wires
-    """Positions of the lower electrodes, metres: x, y and z of each electrode of each wire."""
+    """Positions of the lower electrodes, in metres: x, y and z of each electrode of each wire."""
     resistivity_ohm_per_m: _Resistivity
-    """Resistance of the rubber between two electrodes, divided by their distance, ohm per metre."""
+    """Resistance of the rubber between two electrodes, divided by their distance, in ohms per metre."""
     name: str = "custom"
     """Name of the layout in messages."""
 
@@ -88,7 +88,7 @@ class LayoutConfig(Table):
     """Geometry of a patch, from a preset (:meth:`skinnode.PatchLayout.preset`) or a file."""
 
     file: Annotated[Path | None, Field(strict=False), Allowed("the path of a layout file")] = None
-    """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML file with the other
+    """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, in metres), or TOML file with the other
     keys of this table. If a file is given, the only other key allowed in the table is ``coordinates``. The
     path is relative to the hand file."""
     electrodes: ElectrodesConfig | None = None
@@ -110,7 +110,7 @@ class LayoutConfig(Table):
     lower_electrodes: Count | None = None
     """Number of electrodes per lower wire, M. If None, M equals U."""
     resistivity_ohm_per_m: _Resistivity = 1e7
-    """Resistance of the rubber between two electrodes, divided by their distance, ohm per metre."""
+    """Resistance of the rubber between two electrodes, divided by their distance, in ohms per metre."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
     """Source of the electrode positions: ``preset`` for this table, ``node`` for the patch itself (0x2300).
     Bus-load plans and simulations always use this table, so its numbers of wires and electrodes must be
@@ -167,11 +167,11 @@ class CalibrationConfig(Table):
     """Measured properties of a patch; the baseline and the resistivity have their own keys."""
 
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
+    """Stiffness of the rubber under one electrode, in N/m; overrides ``solver.stiffness_n_per_m``."""
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number from 1e3 to 1e10 (Pa)")
     ] = _RUBBER.young_pa
-    """Young's modulus of the rubber, Pa, used to compute contact forces."""
+    """Young's modulus of the rubber, in Pa; used to compute contact forces."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
         _RUBBER.poisson
     )
@@ -179,11 +179,11 @@ class CalibrationConfig(Table):
     force_calibrated: bool = False
     """Whether ``young_pa`` has been calibrated on this patch, for instance by pressing it with typical
     objects while a load cell measures the force. If false, the standard deviations of normal forces are large
-    enough to cover rubber bonded to a rigid support, where the force can be fifty times as high as for thick
-    rubber. A modulus from a data sheet is not a calibration."""
+    enough to cover rubber bonded to a rigid support, where the force can be fifty times as large as for thick
+    rubber. A modulus from a data sheet does not count as a calibration."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
     """Correction factors, one per upper wire. Each factor multiplies the wire's measured resistances to
-    correct drift since the baseline was measured."""
+    correct for drift since the baseline was measured."""
 
     @property
     def rubber(self) -> Rubber:
@@ -207,7 +207,7 @@ class TolerancesConfig(Table):
     electrode_radius: _Tolerance = ORDINARY.electrode_radius
     """Radius of the electrodes, as a multiple of the pitch. The forward model assumes point electrodes."""
     gain: _Tolerance = ORDINARY.gain
-    """Relative standard deviation of the front end's gain for changes in resistance."""
+    """Relative standard deviation of the gain with which the front end measures changes in resistance."""
 
     @model_validator(mode="before")
     @classmethod
@@ -267,8 +267,8 @@ class PatchConfig(Table):
         TolerancesConfig()
     )
     """Manufacturing tolerances: `"ordinary"` (the default) for a carefully manufactured patch, `"exact"` for
-    a simulated patch, or a table of numbers. A calibration does not replace tolerances, because it does not
-    cover the geometry."""
+    a simulated patch, or a table of numbers. A calibration does not replace the tolerances, because it does
+    not cover the geometry."""
 
     @field_validator("eds", "baseline")
     @classmethod

@@ -24,12 +24,12 @@ class SolverConfig(Table):
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
     """Operator that computes the steps of the method ``exact``."""
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode, N/m; the method ``exact`` uses it to compute forces. The
-    calibration of a patch can override this stiffness."""
+    """Stiffness of the rubber under one electrode, in N/m; the method ``exact`` uses it to compute forces.
+    The calibration of a patch can override this stiffness."""
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")
     ] = None
-    """Time limit for solving one scan, microseconds; None means no limit. At the limit, the solver returns
+    """Time limit for solving one scan, in microseconds; None means no limit. At the limit, the solver returns
     its current estimate."""
     estimate_noise: bool = False
     """Estimate the noise in the resistances from the stream of scans. Requires the method ``posterior``."""
@@ -38,9 +38,9 @@ class SolverConfig(Table):
     ``patch``, or one gain for each upper ``wire``. Requires the method ``posterior``."""
     past: Annotated[Past, one_of(Past)] = "off"
     """Use earlier scans: with ``auto``, the method ``posterior`` combines each scan with earlier scans if the
-    noise is 1e-4 or more; with ``off``, every scan is solved alone."""
+    noise is 1e-4 or more; with ``off``, every scan is solved on its own."""
     normal_only: bool = False
-    """Solve only for the z displacement of the electrodes, not for shear."""
+    """Solve only for the z displacements of the electrodes, not for shear."""
     max_std_m: Annotated[
         float | None,
         Field(gt=0, le=1, allow_inf_nan=False),
@@ -53,8 +53,8 @@ class SolverConfig(Table):
         Field(gt=0, le=1e6, allow_inf_nan=False),
         Allowed("a number greater than 0 and at most 1e6 (N)"),
     ] = None
-    """Maximum standard deviation of the normal forces of contacts in a precise field, newtons. If None, the
-    limit is derived from the layout and the properties of the rubber, and applies only to calibrated
+    """Maximum standard deviation of the normal forces of contacts in a precise field, in newtons. If None,
+    the limit is derived from the layout and the properties of the rubber, and applies only to calibrated
     forces."""
     detect: bool = True
     """Detect touch before solving: report ``touched``, and do not solve the scans of an untouched patch."""
@@ -63,7 +63,7 @@ class SolverConfig(Table):
         Field(ge=1e-6, le=1e4, allow_inf_nan=False),
         Allowed("a number from 1e-6 to 1e4 (1/h)"),
     ] = 0.1
-    """Accepted number of false touches caused by noise alone, per patch and hour."""
+    """Acceptable number of false touches caused by noise alone, per patch and hour."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel. If None, the host uses one thread per core, but at
     most one per patch."""

@@ -22,7 +22,7 @@ class SimulationConfig(Table):
     The host ignores this table.
     """
 
-    seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
+    seed: Annotated[int, Field(ge=0), Allowed("a non-negative integer")] = 1
     """Random seed for the converter noise and the indenter positions."""
     indenter_radius_m: Length = 0.04
     """Radius of the spherical indenter, in metres."""
@@ -34,7 +34,7 @@ class SimulationConfig(Table):
     )
     """Coefficient of friction: ratio of tangential to normal load while sliding."""
     slide_speed_m_per_s: _Speed = 0.008
-    """Sliding speed of the indenter, metres per second."""
+    """Sliding speed of the indenter, in metres per second."""
     cycle_s: _Cycle = 4.0
     """Duration of one cycle (pressing, sliding and lifting off), in seconds."""
     converter_noise: Ratio = 3e-6

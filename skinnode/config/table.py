@@ -61,9 +61,7 @@ Name = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printa
 Count = Annotated[int, Field(ge=1, le=254), Allowed("an integer from 1 to 254")]
 NodeId = Annotated[int, Field(ge=1, le=MAX_NODE_ID), Allowed(f"an integer from 1 to {MAX_NODE_ID}")]
 Length = Annotated[float, Field(ge=1e-6, le=1.0, allow_inf_nan=False), Allowed("a number from 1e-6 to 1 (m)")]
-Ratio = Annotated[
-    float, Field(ge=0, lt=1, allow_inf_nan=False), Allowed("a number of at least 0 and below 1")
-]
+Ratio = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False), Allowed("a non-negative number below 1")]
 Stiffness = Annotated[
     float, Field(ge=1e-3, le=1e12, allow_inf_nan=False), Allowed("a number from 1e-3 to 1e12 (N/m)")
 ]

@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts of a key path. Keys in a hand file have at most six parts."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern for a key with at least 4 × ``_DEEPEST`` parts. It also matches other text with that many words
-joined by dots, which does not occur in hand files."""
+"""Pattern for a key with at least 4 × ``_DEEPEST`` parts. It also matches any other text with that many words
+joined by dots, but hand files contain no such text."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")

@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 class NotApplicable(Exception):
     """Raised if the device does not have the feature that the case checks.
 
-    The message gives the evidence, such as a missing EDS entry or the response of the device.
+    The message states the evidence, such as a missing EDS entry or the device's response.
     """
 
 
@@ -38,15 +38,15 @@ class Warned(Exception):
 class Case:
     """One conformance case.
 
-    ``run`` returns if the verdict is "passed". For the other verdicts, it raises Failed, NotApplicable or
-    Warned.
+    ``run`` returns normally if the verdict is "passed". For the other verdicts, it raises Failed,
+    NotApplicable or Warned.
     """
 
     id: str
     """Area and number of the case, such as ``SDO-07``."""
     title: str
     clause: str
-    """Clause that the case checks, of CiA 301 v4.2.0 unless another document is named."""
+    """Clause that the case checks; from CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property

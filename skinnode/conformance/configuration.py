@@ -16,9 +16,9 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Objects that are written after all others, in this order. The SYNC counter overflow value can be written
-only while the SYNC period (0x1006) is 0. Writing 0x1005 may start the SYNC producer. 0x1020 comes last,
-because writing any other object clears it."""
+"""Objects to write after all others, in this order. The SYNC counter overflow value can be written only while
+the SYNC period (0x1006) is 0. Writing 0x1005 may start the SYNC producer. 0x1020 comes last, because writing
+any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
@@ -42,7 +42,7 @@ def write_back(dut: Dut, before: Values) -> list[str]:
 
     Args:
         dut: The device.
-        before: Original values, by index and sub-index.
+        before: Original values, keyed by index and sub-index.
 
     Returns:
         One line for each value that could not be written.
@@ -73,7 +73,7 @@ def write_back(dut: Dut, before: Values) -> list[str]:
 
 
 def _parameter_of(index: int) -> int:
-    """Return the communication parameter of the PDO to which ``index`` belongs; 0 if it belongs to none."""
+    """Return the communication parameter of the PDO to which ``index`` belongs; 0 if it belongs to no PDO."""
     if index in _MAPPINGS:
         return index - 0x200
     return index if index in _PDO_PARAMETERS else 0

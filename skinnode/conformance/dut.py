@@ -160,7 +160,7 @@ class Dut:
     def need_storage(self, index: int, subindex: int) -> None:
         """Raise NotApplicable if the device cannot store (0x1010) or restore (0x1011) parameters on command.
 
-        This capability is bit 0 of the value read (CiA 301, 7.5.2.13 and 7.5.2.14).
+        This capability is indicated by bit 0 of the value read (CiA 301, 7.5.2.13 and 7.5.2.14).
         """
         self.need(index, subindex)
         try:

@@ -59,8 +59,8 @@ class EdsEntry:
     flags: int
     """ObjFlags: bit 0 is "refuse write on download", bit 1 is "refuse read on scan"."""
     given: bytes | None = None
-    """Exact value as bytes, which takes precedence over ``default``; None if the file does not specify
-    bytes."""
+    """Exact default value as bytes, which takes precedence over ``default``; None if the file does not
+    specify bytes."""
 
     @property
     def size(self) -> int:
@@ -171,7 +171,7 @@ def number(text: str, node_id: int = 0) -> int:
 
 
 def _hex(text: str) -> bytes | None:
-    """Parse hexadecimal text, the CiA 306 notation for an OCTET_STRING; None if the text is malformed."""
+    """Parse hexadecimal text, the CiA 306 notation for an OCTET_STRING; return None if it is malformed."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -314,7 +314,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield one line for each object that is only listed or only described, and for each wrong count."""
+    """Yield one line for each object that is listed or described, but not both, and for each wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

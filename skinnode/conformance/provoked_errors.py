@@ -70,7 +70,7 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
-    """Provoke a communication error: begin to send heartbeats or guarding requests, then stop.
+    """Provoke a communication error: start sending heartbeats or guarding requests, then stop.
 
     Guarding requests are used only if the device has no heartbeat consumer.
 

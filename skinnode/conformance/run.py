@@ -20,7 +20,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of consecutive cases without a response to the reset after which no further cases are run."""
+"""Number of consecutive cases without a response to the reset after which the remaining cases are not run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def _own_eds(sdo: SdoClient) -> Eds:
             "--eds", "nothing", f"the device's EDS, because its identity is unknown: {failure}"
         ) from None
     raise ConfigError(
-        "--eds", "nothing", f"the device's EDS, because product code 0x{product:08X} is not that of a patch"
+        "--eds", "nothing", f"the device's EDS, because 0x{product:08X} is not the product code of a patch"
     )
 
 

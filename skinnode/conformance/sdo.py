@@ -99,7 +99,7 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next response. Raises Failed if none arrives, or if it is not eight bytes long."""
+        """Return the next response. Raises Failed if no response of eight bytes arrives."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
@@ -263,7 +263,7 @@ class SdoClient:
     def write_block(
         self, index: int, subindex: int, data: bytes, *, crc: bool = False, wrong_crc: bool = False
     ) -> None:
-        """Download a value that fits into one sub-block by block transfer, optionally with a wrong CRC."""
+        """Download by block transfer a value that fits into one sub-block, optionally with a wrong CRC."""
         what = f"block write to 0x{index:04X}:{subindex:02X}"
         start = bytes((0xC2 | crc << 2,)) + mux(index, subindex) + struct.pack("<I", len(data))
         answer = self.served(start, what)

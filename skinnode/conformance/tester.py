@@ -77,7 +77,7 @@ class Tester:
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """Most recent frames sent and received since :meth:`begin`, at most 400."""
+        """Most recent frames (at most 400) sent and received since :meth:`begin`."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
@@ -104,7 +104,7 @@ class Tester:
         Args:
             can_id: CAN-ID of the frame.
             within_s: Maximum wait, in s.
-            match: Further condition that the frame must meet.
+            match: Additional condition that the frame must meet.
 
         Returns:
             The frame; None if none arrives within ``within_s``.

@@ -20,13 +20,13 @@ _PLACES: Final = {
 }
 """Positions (mm) and roll, pitch and yaw angles (radians) of the named patches on a half-closed left hand.
 
-The poses are invented; the palm faces along the z axis, and the fingers point along the y axis.
+The poses are fictitious; the palm faces along the z axis, and the fingers point along the y axis.
 """
 _MORE_MM: Final = 50.0
-"""Spacing of the patches without a predefined name, which lie in rows below the wrist, in mm."""
+"""Spacing, in mm, of the patches without a predefined name, which are placed in rows below the wrist."""
 _SYNC_MS_PER_PATCH: Final = 20
-"""SYNC period per patch, ms. A scan consists of 101 frames of up to 135 bits, so the bus load is at most 68 %
-at 1 Mbit/s."""
+"""SYNC period per patch, in ms. A scan consists of 101 frames of up to 135 bits, so the bus load is at most
+68 % at 1 Mbit/s."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:

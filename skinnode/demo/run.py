@@ -55,7 +55,7 @@ class PatchReport:
     latency_p99_ms: float
     score: Score
     distrust: str = ""
-    """Reason why the newest untrusted field was not trusted; empty if all fields were trusted."""
+    """Reason for distrusting the newest untrusted field; empty if all fields were trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Report:
     bus_load: float
     """Equivalent bus load: fraction of the run time for which the frames would occupy a 1 Mbit/s bus."""
     faults: tuple[str, ...]
-    """Faults found, any of which causes exit status 1; empty if the run succeeded."""
+    """Faults found; any fault causes exit status 1. Empty if the run succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class _Watch:
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
-    """Reason why the newest untrusted field was not trusted; empty if all fields were trusted."""
+    """Reason for distrusting the newest untrusted field; empty if all fields were trusted."""
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp

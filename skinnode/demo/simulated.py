@@ -1,7 +1,7 @@
 """Runs simulated patches in a separate process, for commands that demonstrate the host.
 
 In a single process, the patches and the host would compete for the interpreter lock, and the host's
-performance figures would include the simulation.
+performance figures would include the cost of the simulation.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _run_nodes(hand: HandConfig, parent: Connection) -> None:
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent, which also receives it, closes the pipe
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent also receives SIGTERM and closes the pipe
     try:
         with Fleet(hand):
             parent.send("")

@@ -20,7 +20,7 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a height map, characters. Each character shows two pixels, one above the other, so that the map
+"""Width of a height map, in characters. Each character shows two pixels, one above the other, so that the map
 is square."""
 
 

@@ -22,7 +22,7 @@ LONGEST_HEARTBEAT_S: Final = 2.5
 """Maximum wait for a heartbeat, in s. Heartbeats with a longer period are missed."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum waits for the responses to the first and the second remote frame, in s.
+"""Maximum times to wait for the responses to the first and the second remote frame, in s.
 
 The second remote frame is sent in case the node was too busy to answer the first.
 """
@@ -54,7 +54,7 @@ def no_answer(wrong: str) -> str:
 
 
 class BusConnection(Closing):
-    """Open bus; use it in a ``with`` block, or call :meth:`close`.
+    """Connection to an open bus; use it in a ``with`` block, or call :meth:`close`.
 
     Args:
         bus: The bus.
@@ -134,7 +134,7 @@ class BusConnection(Closing):
             raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
 
     def wrong_answer(self, node_id: int, since_ns: int) -> str:
-        """Return the newest frame that a node sent on the COB-ID of its SDO responses.
+        """Return the newest frame that a node sent with the COB-ID of its SDO responses.
 
         Args:
             node_id: A node that sent no valid response.

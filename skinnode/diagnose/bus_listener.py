@@ -1,4 +1,4 @@
-"""Records the messages received on a bus: heartbeats, emergency messages, SDO responses and frame counts.
+"""Records the traffic received on a bus: heartbeats, emergency messages, SDO responses and frame counts.
 
 The receiving thread writes the record without a lock. Other threads must copy a container before they
 iterate over it.
@@ -24,7 +24,7 @@ class Beat(NamedTuple):
 
     t_ns: int
     state: int
-    """NMT state without the toggle bit of node guarding; 0 for a boot-up message."""
+    """NMT state without the node-guarding toggle bit; 0 for a boot-up message."""
 
 
 class Emergency(NamedTuple):
@@ -46,7 +46,7 @@ class NodeTraffic:
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
     """Reception time (ns) and eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Reception time (ns) and data of the newest frame of any length on the COB-ID of SDO responses."""
+    """Reception time (ns) and data of the newest frame of any length with the SDO response COB-ID."""
 
 
 class BusListener:
@@ -60,7 +60,7 @@ class BusListener:
         """Number of NMT commands by their two data bytes: command specifier and node-ID. The key ``b""``
         counts commands of any other length."""
         self.extended = self.remote = self.errors = 0
-        """Numbers of frames with 29-bit identifiers, of remote frames, and of error frames."""
+        """Numbers of extended frames (29-bit identifiers), remote frames and error frames."""
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:

@@ -35,14 +35,14 @@ SCANS: Final = 50
 """Number of scans to capture; with 50 scans, the error in the estimated noise is about 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum duration of the capture, s, regardless of the SYNC period."""
+"""Maximum duration of the capture in s, regardless of the SYNC period."""
 
 DEFAULT_NOISE: Final = 3e-6
 """Relative converter noise assumed if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses before successive attempts to read a node, s. A node's SDO server is busy for 0.1 to 0.3 s while a
-host reads the baseline."""
+"""Pauses before successive attempts to read a node, in s. A node's SDO server is busy for 0.1 to 0.3 s while
+a host reads the baseline."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -233,7 +233,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
-    """Return the minimum SYNC period (s) of a node that has its default inhibit time; 0 for any other node.
+    """Return the minimum SYNC period (s) of a node that has its default inhibit time; 0 for other nodes.
 
     With a shorter period, the node would not finish a scan before the next SYNC. A host replaces the default
     with an inhibit time that suits the hand's SYNC period.
@@ -271,10 +271,10 @@ def _with_scans(
 
 
 def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
-    """Count the NMT commands that a host of this hand would not send.
+    """Count the NMT commands that this hand's host would not send.
 
-    A host sends only *start* and *enter pre-operational*, each addressed to a single patch. A second host of
-    the same hand is therefore not detected here, but by its SYNCs.
+    A host sends only *start* and *enter pre-operational*, each addressed to a single patch. A second host
+    running the same hand is therefore detected by its SYNCs, not here.
     """
     return sum(
         count
@@ -298,7 +298,7 @@ def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> d
 
 
 def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
-    """Return the controller state and bit rate of a SocketCAN interface from ``ip``; None if unknown."""
+    """Return a SocketCAN interface's controller state and bit rate, reported by ``ip``; None if unknown."""
     if bus.interface != "socketcan":
         return None, None
     try:

@@ -1,7 +1,7 @@
 """Provides the electronic data sheet (EDS) of a node: generated for a patch, otherwise read from a file.
 
-The EDS is parsed with the reader of the conformance suite, which preserves default values as written. The
-canopen library does not; the host uses that library as a second, independent reader of a patch's EDS.
+The EDS is parsed with the conformance suite's reader, which preserves default values as written. The canopen
+library does not; the host uses that library as a second, independent reader of a patch's EDS.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from skinnode.protocol.profile import BusType, PatchProfile
 
 
 class DataSheet(NamedTuple):
-    """An EDS or DCF, parsed and as text."""
+    """EDS or DCF, both parsed and as text."""
 
     eds: Eds
     text: str
     """Content of the file; see :class:`~skinnode.canopen.eds_encoding.EdsText`."""
     codec: str = "utf-8"
-    """Codec of the non-ASCII characters in the text."""
+    """Encoding of the non-ASCII characters in the text."""
     note: str = ""
     """Message about the assumed encoding; empty for an ASCII file."""
 

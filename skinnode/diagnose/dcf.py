@@ -1,4 +1,4 @@
-"""Writes and reads the configuration of one device as a DCF (CiA 306), without changing any byte of a value.
+"""Writes and reads the configuration of one device as a DCF (CiA 306), preserving every byte of the values.
 
 Numbers and printable ASCII strings are written to ``ParameterValue`` as CiA 306 specifies, and values of type
 OCTET_STRING or DOMAIN are written there in hexadecimal. CiA 306 has no notation for other strings: INI

@@ -22,7 +22,7 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests in a sweep, in s. At 1 Mbit/s, the requests cause a bus load of one sixth."""
+"""Interval between requests in a sweep, in s. At 1 Mbit/s, the requests use one sixth of the bus capacity."""
 
 ANSWER_S: Final = 0.12
 """Time to wait for responses after the last request in a sweep, in s."""
@@ -35,8 +35,8 @@ LISTEN_S: Final = 1.2
 heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum duration of the search for nodes without a node-ID, s. The search then ends, even if further nodes
-remain unidentified."""
+"""Maximum duration of the search for nodes without a node-ID, in s. The search then ends, even if further
+nodes remain unidentified."""
 
 OTHERS_S: Final = 1.0
 """Maximum wait for the SDO transfers of other clients to end, in s."""
@@ -103,11 +103,11 @@ class Discovery:
     """Result of a search for nodes."""
 
     nodes: tuple[FoundNode, ...]
-    """Nodes with a node-ID, by ascending node-ID."""
+    """Nodes with a node-ID, in ascending order."""
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
-    """Whether there are more nodes without a node-ID, which the search did not identify."""
+    """Whether there are further nodes without a node-ID that the search did not identify."""
     seconds: float
 
 

@@ -145,7 +145,7 @@ class BusFacts:
     role: str = "master"
     """Host's role on this bus, from the hand file."""
     nmt_commands: int = 0
-    """Number of received NMT commands that a host of this hand would not send."""
+    """Number of received NMT commands that this hand's host would not send."""
     master_node_id: int | None = None
     """Node-ID of the host's own heartbeat, from the hand file; None if the host sends none."""
     master_beats_s: Float | None = None

@@ -17,7 +17,7 @@ from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
 
 BOOT_S: Final = 5.0
-"""Maximum time for a node to boot with its new node-ID, s."""
+"""Maximum time for a node to boot with its new node-ID, in s."""
 
 _ASKED_S: Final = 0.15
 _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
@@ -33,7 +33,7 @@ class Commissioned:
     node_id: int | None
     """New node-ID; None if unchanged."""
     bitrate_bps: int | None
-    """New bit rate, bit/s, which takes effect at the next power-on; None if unchanged."""
+    """New bit rate in bit/s, which takes effect at the next power-on; None if unchanged."""
     stored: bool
     booted: bool
     """Whether the node booted with its new node-ID; True if the node-ID is unchanged."""
@@ -50,7 +50,7 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
         if not found:
-            needed = "a serial number, because no node without a node-ID was found"
+            needed = "a serial number, because the search for nodes without a node-ID found none"
             raise ConfigError("--serial", None, needed)
         there = f"{len(found)}{' and more' if more else ''} nodes have no node-ID (serials {serials})"
         raise ConfigError("--serial", None, f"a serial number, because {there}")

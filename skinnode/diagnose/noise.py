@@ -28,10 +28,10 @@ LEAST_SCANS: Final = 20
 deviation exceeds 25 %."""
 
 _MOST_SCANS: Final = 64
-"""Maximum number of most recent scans to analyse. The computing time grows with the square of this number."""
+"""Maximum number of recent scans to analyse. The computing time grows with the square of this number."""
 
 _FLOOR: Final = 8
-"""Number of singular values in the noise floor of a patch. They determine the noise to within 20 %."""
+"""Number of singular values used for a patch's noise floor. They determine the noise to within 20 %."""
 
 _MOVED: Final = 6.0
 """Minimum standard deviation of a touched crossing's signal, relative to the stated noise."""
@@ -74,9 +74,9 @@ class NoiseAnalysis:
     """(U,) noise of each upper wire relative to the stated noise, hardly affected by a touch; 0 if
     unknown."""
     lower: Float
-    """(K,) noise of each lower wire, in the same form as ``upper``."""
+    """(K,) noise of each lower wire, defined as for ``upper``."""
     floor: float
-    """Noise of the whole patch, in the same form as ``upper``."""
+    """Noise of the whole patch, defined as for ``upper``."""
     supply: float
     """Noise common to all crossings, relative to the stated noise; 0 unless the individual noise of the
     crossings is much smaller."""
@@ -130,8 +130,8 @@ def _unexplained(moved: Float) -> Float:
 
     The signals of each upper wire are projected onto the complement of the leading principal components of
     all other upper wires; half of the components count as leading. The same is done for lower wires. Each
-    crossing thus has two residuals, of which the larger standard deviation is returned. ``moved`` must have
-    mean 0.
+    crossing thus has two residuals; the larger of their standard deviations is returned. ``moved`` must have
+    zero mean.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -159,7 +159,7 @@ def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
 
 
 def _floor(moved: Float, values: int) -> float:
-    """Return the norm of the smallest singular values of (T, n) data, relative to that of unit noise."""
+    """Return the norm of the smallest singular values of (T, n) data, relative to the norm for unit noise."""
     return _smallest(moved, values) / _of_noise(moved.shape, values) if moved.shape[1] else 0.0
 
 

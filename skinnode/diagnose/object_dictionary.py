@@ -261,7 +261,7 @@ def compare(
         eds: The file. All readable objects with a value are compared, except :data:`NOT_CONFIGURATION` and
             commands.
         node_id: Value of $NODEID in the file.
-        progress: Called with the current position.
+        progress: Called with a progress message.
 
     Returns:
         The objects whose values differ.
@@ -293,8 +293,8 @@ def compare(
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
     """Return whether the value on the node equals the value in the file.
 
-    Trailing NULs of a string are ignored, because the default of an EDS cannot express them. They are
-    significant if the file gives the value byte by byte.
+    Trailing NULs of a string are ignored, because an EDS default cannot express them. They are significant
+    if the file specifies the value byte by byte.
     """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
     return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)

@@ -92,10 +92,14 @@ RULES: Final = (
         _RESTARTED,
     ),
     Rule("(upper|lower) wires (open|shorted|out of range)", (*_ERRORS, "noise on .* wire"), _WIRE),
-    Rule("the controller is", ("error frames on the bus", "no node of the hand answers", *_LATE), _ANYTHING),
+    Rule(
+        "the controller is",
+        ("error frames on the bus", "none of the hand's nodes answers", *_LATE),
+        _ANYTHING,
+    ),
     Rule(
         "the bit rate of the interface differs",
-        ("error frames on the bus", "no node of the hand answers", "the controller is", *_LATE),
+        ("error frames on the bus", "none of the hand's nodes answers", "the controller is", *_LATE),
         _ANYTHING,
     ),
     Rule(

@@ -58,9 +58,9 @@ class Tared:
     median_change: float | None = None
     """Median of (new R0 / old R0) − 1; None if there were no old R0 values."""
     touched_crossings: int = 0
-    """Number of crossings whose R0 changed as if something had touched the skin at this or the last tare."""
+    """Number of crossings whose R0 changed as if touched during this or the previous tare."""
     touched_change: float = 0.0
-    """Largest relative change of these crossings, apart from the changes of their wires."""
+    """Largest relative change of these crossings, after subtracting the changes of their wires."""
 
     @property
     def done(self) -> bool:
@@ -85,7 +85,7 @@ def tare(
     sync_period_s: float = 0.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Tared:
-    """Tare one node and read its new baseline back.
+    """Tare one node and read back its new baseline.
 
     Args:
         connection: The bus.
@@ -95,7 +95,7 @@ def tare(
         progress: Called with a description of each step.
 
     Returns:
-        The result, including the case that the node does not answer or refuses to tare.
+        The result, which also reports a node that does not answer or refuses to tare.
 
     Raises:
         BusError: The bus failed.

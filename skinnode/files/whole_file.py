@@ -1,8 +1,9 @@
 """Writes files atomically.
 
-The new content is written to a temporary file with a random name in the same folder, which is then renamed.
-Readers therefore see either the complete old content or the complete new content. If writing fails, the file
-keeps its old content. The temporary file is always newly created, never opened through a symbolic link.
+The new content is written to a temporary file with a random name in the same folder; then this file is
+renamed. Readers therefore see either the complete old content or the complete new content. If writing fails,
+the file keeps its old content. The temporary file is always newly created, never opened through a symbolic
+link.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_file(path: Path) -> None:
-    """Flush the content of a file to the storage medium, also if other code has written the file.
+    """Flush the content of a file to the storage medium, even if other code wrote the file.
 
     Raises:
         OSError: The content cannot be written.

@@ -49,7 +49,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
-        ("outages", "outage of the interface", "outages of the interface"),
+        ("outages", "interface outage", "interface outages"),
         ("bus_offs", "time bus-off", "times bus-off"),
         ("error_frames", "error frame", "error frames"),
     )

@@ -39,7 +39,7 @@ class ArrivalPredictor:
         period_ns, ends = self._period_ns, self._ends
         ends.appendleft(t_ns)
         due: list[int] = []
-        for end_ns in ends:  # newest first, because it is the best predictor
+        for end_ns in ends:  # newest first, because the newest end is the best predictor
             due_ns = end_ns + ((t_ns - end_ns + period_ns // 2) // period_ns + 1) * period_ns
             for other_ns in due:
                 if -APART_NS < due_ns - other_ns < APART_NS:

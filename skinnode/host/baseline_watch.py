@@ -22,7 +22,7 @@ _DOUBT_NS: Final = 2_000_000_000
 
 _REGISTER_NS: Final = 500_000_000
 """Minimum interval (ns) between reads of a nonzero error register. With these reads, a patch is reported as
-operational within a second of its error ending, even if the EMCY message that clears the error is lost. The
+operational within a second after its error ends, even if the EMCY message that clears the error is lost. The
 reads use four SDO frames per second.
 """
 

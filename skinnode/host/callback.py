@@ -80,7 +80,7 @@ class FieldCallback:
         try:
             field = self._fields.take(None)
         except SkinError as error:  # the error that stopped the host
-            _log.warning("callback %s is not called any more: %s", _name(self._function), error)
+            _log.warning("callback %s is no longer called: %s", _name(self._function), error)
             return False
         if field is None:
             return False

@@ -6,7 +6,7 @@ writes.
 
 On a bus that another master runs, the host sends no NMT commands and leaves the SYNC parameters unchanged. It
 writes a patch-specific parameter only if the node's value differs from the hand file. With
-``guest_sends = "nothing"``, the host sends no frames and takes all facts about the node from files.
+``guest_sends = "nothing"``, the host sends no frames and reads all facts about the node from files.
 """
 
 from __future__ import annotations
@@ -34,8 +34,7 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""Time limit (s) for a node's first response. Booting and the initial tare take a node less than 1 s in
-total.
+"""Time limit (s) for a node's first response. Booting and the initial tare together take less than 1 s.
 """
 
 HEARTBEATS_WATCHED: Final = 3

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
-"""First and longest pause (s) after an exception in a loop. The pauses are short, because a loop may serve
+"""Initial and maximum pause (s) after an exception in a loop. The pauses are short, because a loop may serve
 several patches or buses.
 """
 

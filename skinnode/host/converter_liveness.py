@@ -95,7 +95,7 @@ class Alive(enum.StrEnum):
     YES = "yes"
     NO = "no"
     CANNOT_TELL = "cannot tell"
-    """No scan has arrived yet, or no code has changed for a second for an unknown reason.
+    """No scan has arrived yet, or no code has changed for a second and the cause is unknown.
 
     One such case is a patch that does not count its conversions and whose converter has so little noise that
     it repeats its codes even while running.

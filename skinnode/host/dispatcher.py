@@ -137,7 +137,7 @@ class Dispatcher:
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
-        """Call ``poller`` regularly with the monotonic time (ns), after batches of frames and on an idle bus.
+        """Call ``poller`` regularly with the monotonic time (ns), even while the bus is idle.
 
         Args:
             poller: Function to call, at most once every 2 ms.

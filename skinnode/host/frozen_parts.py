@@ -91,8 +91,8 @@ class FrozenParts:
 
         Args:
             measured: Noise (codes) measured in the recent windows of scans; 0 if not measurable.
-            least: Smallest code of a scan. It has the least noise, because the noise is proportional to the
-                resistance.
+            least: Smallest code of a scan. This code has the least noise, because noise is proportional to
+                the resistance.
         """
         ratio = max(self._scale.lo + least * self._scale.step, self._scale.step)
         self._log_stay = log_stay(ratio * max(self._stated / QUIETER, 0.5 * measured))

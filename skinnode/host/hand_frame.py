@@ -29,9 +29,9 @@ OVERTAKEN: Final = "overtaken"
 """Reason for a missing field: the patch has already delivered the field of a newer scan."""
 
 _Number = tuple[int, int]
-"""Run and scan number. Scan numbers start again in each run."""
+"""Run and scan number. Scan numbers restart in each run."""
 _BEFORE: Final = (0, 0)
-"""Number before the first scan of the first run."""
+"""Run and scan number that precede those of all scans."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,7 @@ class HandFrame:
 
     scan: int
     """Scan number of all fields: the SYNC number, counted from the start of the host. It does not wrap
-    around. In a remote hand, it starts again when the daemon restarts; ``stamp.run`` of the fields then
-    increases.
+    around. In a remote hand, numbering restarts with the daemon; ``stamp.run`` of the fields then increases.
     """
     t_sync_ns: int
     """Monotonic time (ns) of the SYNC; 0 if unknown. With staggered SYNC (``sync.stagger_ms``), the buses
@@ -155,9 +154,9 @@ class HandGatherer:
     """Assembles hand frames and returns them in order of run and scan number. Not thread-safe.
 
     A hand frame is ready when each awaited patch has delivered the field of this or a later scan. After
-    :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames without its field, a patch is not
-    awaited until its next field arrives. A hand frame is ready no later than ``patience_ns`` after its first
-    field.
+    :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames without its field, a patch is no longer
+    awaited; it is awaited again once its next field arrives. A hand frame is ready no later than
+    ``patience_ns`` after its first field.
 
     Args:
         patches: Names of the patches.
@@ -322,7 +321,7 @@ class HandSubscription(Closing):
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time (s) to the earlier of ``end_ns`` and the next deadline; None if neither is set."""
+        """Return the time (s) to ``end_ns`` or the next deadline, whichever is first; None without either."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 

@@ -1,4 +1,4 @@
-"""Define the health of patches and buses, and derive the condition of a patch.
+"""Define health snapshots of patches and buses, and derive the condition of a patch.
 
 The evidence for the condition comes from :class:`~skinnode.host.node_monitor.NodeMonitor`.
 """
@@ -112,8 +112,8 @@ class PatchHealth:
     by the next bring-up.
     """
     slow_overruns: int = 0
-    """Number of EMCY messages (code 0x8110) about scans that the node skipped because its computer or the bus
-    was too slow.
+    """Number of EMCY messages (code 0x8110) about scans that the node skipped because the computer running it
+    or the bus was too slow.
     """
     baselines: int = 0
     """Number of new baselines that the host has read, for example after a tare."""

@@ -28,7 +28,7 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, each with the singular and any irregular plural for event texts."""
+"""Counters of :class:`PatchHealth`, mapped to the singular and any irregular plural for event texts."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -40,7 +40,7 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, each with the singular and any irregular plural for event texts."""
+"""Counters of :class:`BusHealth`, mapped to the singular and any irregular plural for event texts."""
 
 
 def _monotonic_ns() -> int:
@@ -52,7 +52,7 @@ def _is_frozen_part(fault: DataFault) -> bool:
 
 
 class HealthWatch:
-    """Publisher of the changes in the health of all patches and buses, and of onsets and releases.
+    """Publishes changes in the health of all patches and buses, and the onsets and releases of touches.
 
     Threads: a dedicated thread checks the health, from :meth:`__enter__` until :meth:`close`. Without that
     thread, the caller calls :meth:`check`.
@@ -188,7 +188,7 @@ class HealthWatch:
     ) -> None:
         for counter, words in counters.items():
             count = getattr(now, counter)
-            if not count:  # true for most counters of a healthy hand
+            if not count:  # most counters of a healthy hand are 0
                 continue
             detail = ""
             if isinstance(now, BusHealth) and counter == "foreign":

@@ -44,7 +44,7 @@ class HostStats:
     malformed: tuple[CodecError, ...]
     """First malformed frame received on each bus, if any."""
     defects: Mapping[str, DefectStats]
-    """Statistics of contained exceptions, by patch or bus name. The key ``host`` holds the exceptions that
+    """Statistics of contained exceptions, by patch or bus name. The key ``host`` contains the exceptions that
     concern no particular patch or bus.
     """
 

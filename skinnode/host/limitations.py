@@ -82,7 +82,7 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
     if method == "exact" and not patch.tolerances.build().exact:
         yield (
             "solver.method",
-            "the exact inverse cannot include the tolerances of the patch: its standard deviations are "
+            "the exact inverse cannot account for the patch's tolerances: its standard deviations are "
             'correct only if all electrodes are exactly at their nominal positions; method = "auto" uses the '
             "posterior",
         )

@@ -71,8 +71,8 @@ class LssMaster:
     The master sends its requests through ``send``. The caller must pass every response (COB-ID 0x7E4) to
     :meth:`on_response`.
 
-    Threads: the mainline calls :meth:`on_response`. Of the other methods, only :meth:`give_node_id` may be
-    called from several threads at once.
+    Threads: the mainline calls :meth:`on_response`. Among the other methods, only :meth:`give_node_id`
+    may be called from several threads at once.
     """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:

@@ -257,7 +257,7 @@ class NodeMonitor:
         beats, period_ns = self._beats, heartbeat_s * 1e9
         if len(beats) < BEATS:
             return False
-        first_ns, last_ns = beats[0], beats[-1]  # appending does not shrink the deque
+        first_ns, last_ns = beats[0], beats[-1]  # safe: a concurrent append never shrinks the deque
         if now_ns - last_ns > HEARTBEATS_MISSED * period_ns:
             return False
         return last_ns - first_ns < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns

@@ -44,8 +44,8 @@ priority, because applications are waiting for the fields of all patches.
 class StreamStats:
     """Counters of a patch's scans.
 
-    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan is finally
-    counted as ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
+    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan eventually
+    counts as ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
     """
 
     frames: int
@@ -61,7 +61,7 @@ class StreamStats:
     untrusted: int
     """Number of untrusted fields."""
     invalid_codes: int
-    """Number of codes, over all solved scans, that mark a crossing as over range, short, open or missing."""
+    """Number of codes in all solved scans that mark a crossing as over range, shorted, open or missing."""
     assembler: AssemblerStats
     failed: int = 0
     """Number of scans whose decoding or solving raised an exception."""
@@ -115,7 +115,7 @@ class StreamOptions:
     """Function called with each assembled scan."""
     judge: Callable[[Scan, int], Verdict] = _find_nothing
     """Function called with each assembled scan and its number before the scan is solved. By then, ``watch``
-    has been called with all earlier scans, so a replay gives the same verdicts as the host.
+    has been called with all earlier scans, so a replay produces the same verdicts as the host.
     """
     watch: Callable[[Scan], None] = _ignore
     """Function called with each assembled scan after :data:`WATCH_AFTER_NS`, or when the next scan

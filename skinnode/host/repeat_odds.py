@@ -5,7 +5,7 @@ deviation of the noise in codes. This maximum is reached if the true value lies 
 quantization step, as it does at rest after a tare.
 
 Under a press, the crossings have different values, whose positions within their quantization steps are
-practically random. For a random position, n + 1 readings of one crossing all give the same code with
+practically random. For a random position, n + 1 readings of one crossing all yield the same code with
 probability E max(0, 1 − σ R), where R is the range of n + 1 standard normal variables. This is much less than
 the maximum, even for a converter with little noise.
 """

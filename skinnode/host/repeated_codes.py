@@ -56,7 +56,7 @@ LEAST_RUN: Final = 5
 codes have moved.
 """
 LEADS: Final = 3
-"""Minimum number of crossings that must have a sufficient lead before a wire counts as frozen."""
+"""Minimum number of crossings with a sufficient lead for a wire to count as frozen."""
 
 _Int = NDArray[np.int64]
 

@@ -9,8 +9,8 @@ from skinnode.process import clock
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause (s) before a failed operation is retried. Each pause is twice the previous one, up
-to the longest.
+"""Initial and maximum pause (s) before a failed operation is retried. Each pause is twice the previous one,
+up to the maximum.
 """
 
 

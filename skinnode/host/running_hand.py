@@ -17,7 +17,7 @@ from skinnode.model.layout import PatchLayout
 
 
 class RunningHand(ABC):
-    """Running hand: :class:`skinnode.Host` if this process runs it, or :class:`skinnode.RemoteHand`.
+    """Running hand: :class:`skinnode.Host` if this process runs it, otherwise :class:`skinnode.RemoteHand`.
 
     Threads: any thread may call any method.
 
@@ -109,7 +109,7 @@ class RunningHand(ABC):
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
         """Subscribe to touches, and to changes in the health of patches, wires and buses.
 
-        A remote hand also has ``away`` and ``back`` events, whose subject is ``host``, for its daemon.
+        A remote hand also publishes ``away`` and ``back`` events about its daemon, with the subject ``host``.
 
         Args:
             capacity: Queue length, in events. A full queue drops its oldest event.

@@ -65,7 +65,7 @@ class ScanSolver:
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Return the resistances of a scan. A code that is not a measurement gives NaN."""
+        """Return the resistances of a scan. A code that is not a measurement becomes NaN."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._codes.gain is not None:
             resistance_ohm *= self._codes.gain

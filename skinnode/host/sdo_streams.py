@@ -131,7 +131,7 @@ class BlockUpload(BlockUploadStream):
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # canopen is not typed
 
     def _retransmit(self) -> bytes:
-        """Request the segments after the last valid one again, and return the first of them.
+        """Request all segments after the last valid one again, and return the first of these segments.
 
         Raises:
             SdoError: if the segment does not arrive in time, or the response is an abort.

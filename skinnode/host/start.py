@@ -23,7 +23,7 @@ BRING_UP_THREADS: Final = 16
 
 _BRING_UPS: Final = 3
 """Maximum number of attempts to configure a node. An attempt is repeated after an unexpected exception or a
-boot-up of the node. The node boots, for example, when LSS has set its node-ID.
+boot-up of the node. The node boots, for example, after LSS has set its node-ID.
 """
 
 _START_AGAIN_NAPS: Final = 50
@@ -73,7 +73,7 @@ def configure_all(
 
 
 class _Start:
-    """Configuration of several nodes on a pool of threads."""
+    """Configuration of several nodes on a thread pool."""
 
     def __init__(
         self, nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]

@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Time limit (s) for the first SDO response, and for the tare, of a node that has sent a frame."""
+"""Time limit (s) for the first SDO response and the tare, once the node has sent a frame."""
 
 LEAST_NS: Final = 300_000_000
 """Minimum time (ns) between two bring-ups of a node that restarts in a loop."""

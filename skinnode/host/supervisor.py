@@ -44,7 +44,7 @@ from skinnode.process.closing import Closing
 _log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Maximum number of jobs in parallel, one per node. With more, the bus becomes the bottleneck."""
+"""Maximum number of parallel jobs, one per node. With more, the bus becomes the bottleneck."""
 
 _TURN_S: Final = 0.02
 """Interval (s) between checks of all nodes."""

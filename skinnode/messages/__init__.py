@@ -1,7 +1,7 @@
 """ROS 2 messages for a hand: standard messages where they exist, and ``skinnode_msgs`` for the rest.
 
 ``definitions`` contains the message definitions that rosbags does not include. ``typestore`` encodes and
-decodes messages as CDR with rosbags, an optional dependency. Each other module converts one kind of host
+decodes messages as CDR with rosbags, an optional dependency. Every other module converts one kind of host
 data: ``can_frames`` (raw CAN frames), ``fields`` (displacement fields), ``contacts`` (contacts and their
 wrenches), ``health`` (health and events), and ``poses`` (poses of patches and links). ``full_field`` and
 ``health_report`` convert fields and health losslessly, for :mod:`skinnode.remote`. ``topics`` names topics

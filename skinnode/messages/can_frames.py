@@ -55,7 +55,7 @@ class FrameEncoder:
         self._frame_id = frame_id
         self._templates: dict[tuple[bool, int], bytes] = {}
         self._numbers = -(-(_AFTER_TIME + 4 + len(frame_id.encode()) + 1) // 4) * 4
-        """Offset of the CAN identifier, in bytes. ``frame_id``, with its length and final zero, precedes it;
+        """Offset of the CAN identifier, in bytes. ``frame_id``, with its length and final NUL, precedes it;
         the offset is a multiple of 4.
         """
 

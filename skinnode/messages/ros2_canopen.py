@@ -6,7 +6,7 @@ the values that the host writes as the NMT master of the bus (:mod:`skinnode.hos
 order.
 
 The master does not receive the chunks. Otherwise, the proxy driver of ros2_canopen would put every mapped
-value of every chunk into a queue without a limit, from which it takes at most ten values per period
+value of every chunk into an unbounded queue, from which it removes at most ten values per period
 (``node_canopen_base_driver_impl.hpp`` and ``exchange.hpp``, version 0.3.4).
 """
 
@@ -26,14 +26,14 @@ from skinnode.protocol.eds_files import eds_name, eds_text
 from skinnode.protocol.profile import PatchProfile
 
 BOOT_TIMEOUT_MS: Final = 3000
-"""Time limit (ms) for the boot of a patch, as for the host."""
+"""Time limit (ms) for a patch to boot; the same as the host's."""
 
 SDO_TIMEOUT_MS: Final = 200
 """Time limit (ms) for an SDO response. The default of ros2_canopen, 20 ms, is too short for a Linux board
 under load."""
 
 _RESERVED: Final = ("master", "options")
-"""Words that ros2_canopen looks for in the names of devices (``device_container.cpp``)."""
+"""Words that ros2_canopen looks for in device names (``device_container.cpp``)."""
 
 
 def package_files(hand: HandConfig) -> dict[str, str]:
@@ -143,7 +143,7 @@ def _device(hand: HandConfig, bus: BusConfig, patch: PatchConfig, name: str) -> 
 def _values(
     hand: HandConfig, patch: PatchConfig, profile: PatchProfile
 ) -> Iterator[tuple[int, int, int, str]]:
-    """Yield index, sub-index, value and meaning of what the master writes to a patch, in this order."""
+    """Yield index, sub-index, value and meaning of each object the master writes to a patch, in order."""
     sync = hand.sync
     yield od.COB_ID_SYNC, 0, od.SYNC_COB_ID, "identifier of SYNC"
     yield od.CYCLE_PERIOD, 0, 0, "0x1019 can be written only while this is 0"

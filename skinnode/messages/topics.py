@@ -1,4 +1,4 @@
-"""Names the ROS 2 topics of a hand and the coordinate frames of its patches.
+"""Defines the names of a hand's ROS 2 topics and of its patches' coordinate frames.
 
 A ROS 2 name contains only letters, digits and underscores. Any other character in a name from the hand file
 becomes an underscore.
@@ -90,7 +90,7 @@ def patch_frame(patch: str) -> str:
 
 
 def ros_names(names: Iterable[str]) -> dict[str, str]:
-    """Return a valid and unique ROS 2 name for each name of a hand file."""
+    """Return a valid and unique ROS 2 name for each name in a hand file."""
     tokens: dict[str, str] = {}
     for name in names:
         token = re.sub("[^A-Za-z0-9_]", "_", name) or "_"

@@ -27,7 +27,7 @@ def require_mcap(option: str) -> None:
     missing = [name for name in ("mcap", "rosbags") if find_spec(name) is None]
     if missing:
         got = Shown(f"no package {' and no package '.join(missing)}")
-        raise ConfigError(option, got, "the packages of the extra mcap (install: sh install.sh mcap)")
+        raise ConfigError(option, got, "the packages of the mcap extra (install: sh install.sh mcap)")
 
 
 @functools.cache
@@ -82,7 +82,7 @@ def schema_text(name: str) -> str:
 def seconds_and_ns(t_ns: int) -> tuple[int, int]:
     """Split a Unix time (ns) into the fields of ``builtin_interfaces/Time``.
 
-    A time before 1970 or after 2038, which the message cannot hold, is clamped to the nearest possible time.
+    A time before 1970 or after 2038, which the message cannot represent, is clamped to the nearest limit.
     """
     return divmod(min(max(t_ns, 0), _LATEST_NS), 1_000_000_000)
 

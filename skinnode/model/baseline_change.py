@@ -1,4 +1,4 @@
-"""Compares a new baseline R0 with the old one: has something touched the skin during one of the tares?
+"""Compares a new baseline R0 with the old one: did something touch the skin during either tare?
 
 Temperature, ageing and contact resistance change the readings of whole wires. A touch changes the readings of
 a few crossings of several wires. The test therefore removes the median change of each wire.
@@ -14,16 +14,17 @@ from skinnode.model.layout import Float
 
 LOCAL_CHANGE: Final = 0.002
 """Minimum relative change of a crossing that a touch may have caused. In the model of the staggered preset, a
-press of 10 % of the layer thickness over three pitches changes the largest reading by 0.8 %."""
+press of 10 % of the layer thickness over three pitches changes the most affected reading by 0.8 %."""
 
 NOISES: Final = 8.0
-"""The same minimum, in standard deviations of the changes (from their median absolute deviation)."""
+"""The same minimum, in standard deviations estimated from the changes' median absolute deviation."""
 
 LEAST_SHARE: Final = 0.01
-"""Fraction of the crossings of which more must have changed. Fewer are likely to be single defects.
+"""Fraction of changed crossings above which a touch is reported. A smaller fraction probably results from
+defects of single crossings.
 
-With the noise of a baseline of rubber, 2.5e-4, presses of 20 % of the layer thickness are found, but not all
-presses of 10 %.
+With 2.5e-4 noise in the baseline, as for rubber, the test detects presses of 20 % of the layer thickness, but
+not all presses of 10 %.
 """
 
 TOUCHED: Final = "as if something touched the skin now or at the previous tare: clear the skin and tare again"

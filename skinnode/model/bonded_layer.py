@@ -9,7 +9,7 @@ number k and amplitude 1 displaces the surface by the following amplitudes, wher
 The normal displacement has the direction of the pressure. The outward displacement is tangential, points away
 from the load, and has a phase shift of 90°. Both formulas follow from the biharmonic stream function of an
 incompressible layer with zero displacement at z = −h and zero shear traction at z = 0. For x → ∞, the normal
-displacement approaches that of a half-space, 1 / (2 G k), and the outward displacement vanishes.
+displacement approaches the half-space value, 1 / (2 G k), and the outward displacement vanishes.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ class DataFault:
     of the tracker.
     """
     deviations: float = 0.0
-    """Significance of the fault: number of standard deviations that have the same tail probability in a
-    normal distribution; inf if the fault is certain.
+    """Significance of the fault, in standard deviations of a normal distribution with the same tail
+    probability; inf if the fault is certain.
     """
 
     @property

@@ -42,7 +42,7 @@ class ScanStamp:
     """Time at which the displacement field was ready; 0 if it is not ready yet."""
     run: int = 0
     """Number of restarts of a remote hand's daemon since the program connected; 0 in a host. Scan numbers
-    start again in each run.
+    restart in each run.
     """
 
     def solved_at(self, t_ns: int) -> ScanStamp:
@@ -190,7 +190,7 @@ class FieldFrame:
     touched: bool | None = None
     """Whether the detector reports a touch; None if the detector is switched off, or if fewer than half of
     the readings are usable. A touch continues without interruption until the mean of four scans agrees with
-    rest. Noise alone causes at most ``false_alarms_per_hour`` reports per hour.
+    the rest state. Noise alone causes at most ``false_alarms_per_hour`` reports per hour.
     """
     touch_odds: float | None = None
     """Odds of touch versus no touch, given the readings of this scan and the odds after the previous scan;

@@ -30,7 +30,7 @@ def relative_residual(a: _T, f: _T) -> _T:
 
 
 relative_residual_part = njit_body(relative_residual)
-"""Version of ``relative_residual`` that kernels can call."""
+"""Version of ``relative_residual`` that can be called from kernels."""
 
 
 @njit_part

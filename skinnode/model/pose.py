@@ -13,12 +13,12 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Maximum deviation of a quaternion's length from 1, chosen to accept rounded input."""
+"""Maximum deviation of a quaternion's length from 1, large enough to accept rounded input."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and orientation of a coordinate frame, such as that of a patch, in its parent frame.
+    """Position and orientation of a coordinate frame, such as a patch's, relative to its parent frame.
 
     In the frame of a patch, x points along the upper wires, y across them, and z out of the skin.
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class Status(enum.IntEnum):
-    """Outcome of a solve. The result of a solve that did not converge is the best iterate found."""
+    """Outcome of a solve. If the solve did not converge, its result is the best iterate found."""
 
     CONVERGED = 0
     """The result is a root and passed all checks."""

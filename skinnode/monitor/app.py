@@ -28,7 +28,7 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between screen updates, in seconds."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor core's time spent on drawing.
+"""Maximum fraction of one CPU core's time that drawing may use.
 
 If drawing is slow, the screen is updated less often.
 """
@@ -270,11 +270,11 @@ class MonitorApp(App[None]):
     def action_reset(self) -> None:
         """Ask for confirmation, then reset the node of the selected patch."""
         names, done = [self._names[self._selected]], "reset; the host brings its node up again"
-        text = f"Reset the node of {names[0]}?\n\nUntil the host has brought it up again, it sends no data."
+        text = f"Reset the node of {names[0]}?\n\nIt sends no data until the host has brought it up again."
         self._ask(text, "reset", lambda: self._command(names, "reset", self._source.reset_node, done))
 
     def _ask(self, text: str, verb: str, act: Callable[[], None]) -> None:
-        """Ask for confirmation, then act; or say why the source accepts no commands."""
+        """Ask for confirmation, then act; if the source accepts no commands, show the reason instead."""
         if (refusal := self._source.no_commands) is not None:
             self._say(refusal, "bad")
             return

@@ -1,4 +1,4 @@
-"""Renders a displacement field as characters: depth is shown by brightness, shear by arrows.
+"""Renders a displacement field as characters: depth as brightness, shear as arrows.
 
 The x axis of the patch (along the upper wires) points right, and its y axis points up. A character shows two
 pixels, one above the other, so that pixels are roughly square. Without colours, the density of a character
@@ -107,7 +107,7 @@ def aspect_of(upper_m: Float) -> float:
 
 
 def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """Return the size of the largest map that fits in a box; characters are twice as high as wide."""
+    """Return the size of the largest map that fits in a box, if characters are twice as tall as wide."""
     across = min(width, round(2 * height * aspect))
     return max(2, across), max(1, min(height, round(across / (2 * aspect))))
 
@@ -175,7 +175,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear (m) drawn at full brightness; a quarter of that depth, because shear is smaller."""
+        """Shear (m) at full brightness; a quarter of ``full_m``, because shear is smaller than depth."""
         return 0.25 * self.full_m
 
 

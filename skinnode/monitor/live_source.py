@@ -1,4 +1,4 @@
-"""Provides the data of a running hand to the monitor and the 3-D view: of a host or of a remote hand."""
+"""Provides data from a running hand (a host or a remote hand) to the monitor and the 3-D view."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CAPACITY: Final = 1
 
 
 class LiveSource(Closing):
-    """Data source for a running hand, which the caller closes.
+    """Data source for a running hand; the caller must close the hand.
 
     Args:
         running: The running hand.
@@ -80,7 +80,7 @@ class LiveSource(Closing):
         streams: Mapping[str, StreamStats],
         away: str | None = None,
     ) -> Snapshot:
-        """Return the current state of the hand, given what only a host or only a remote hand has.
+        """Return the current state of the hand, given the data specific to a host or a remote hand.
 
         Raises the SkinError that stopped the hand, if any.
         """

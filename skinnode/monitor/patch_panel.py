@@ -28,7 +28,7 @@ _LABEL: Final = 10
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw all patches as tiles in ``height`` lines, choosing the number of columns for the largest maps."""
+    """Draw all patches as tiles in ``height`` lines, with as many columns as give the largest maps."""
     theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
@@ -65,8 +65,9 @@ def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) 
 def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
     """Draw the depth map of a patch, centred in its box.
 
-    Untouched skin is as dark as the screen, so an outline marks the edge of the map. If a patch has stopped
-    sending data, its last map is drawn without colours, with the condition of the patch written across it.
+    Untouched skin is as dark as the background, so an outline marks the edge of the map. If a patch has
+    stopped sending data, its last map is drawn without colours, with the condition of the patch written
+    across it.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -96,7 +97,7 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
 
 
 def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
-    """Return the width and height of the largest map in a box, and the characters taken up by its outline.
+    """Return the width and height of the largest map in a box, and the extra characters for its outline.
 
     A small box has no outline.
     """
@@ -234,7 +235,7 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
 
 
 def _field_facts(patch: PatchView, theme: Theme) -> list[tuple[str, str, Style]]:
-    """Return facts about a patch's newest field; none if there is no field."""
+    """Return the values of a patch's newest field as (name, text, style); empty if there is no field."""
     if patch.depth_m is None:
         return []
     std = "" if patch.depth_std_m is None else f" ± {1e6 * patch.depth_std_m:.1f}"
@@ -254,7 +255,7 @@ def _field_facts(patch: PatchView, theme: Theme) -> list[tuple[str, str, Style]]
 
 
 def _losses(patch: PatchView, theme: Theme) -> list[tuple[str, str, Style]]:
-    """Return facts about a patch's losses since the start and, for a remote hand, about the transit."""
+    """Return a patch's losses since the start or, for a remote hand, the transit losses and delay."""
     stream, arrivals = patch.stream, patch.arrivals
     if stream is None:
         delay = "" if arrivals.transit_s is None else f", {1e3 * arrivals.transit_s:.1f} ms"

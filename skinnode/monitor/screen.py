@@ -79,7 +79,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Describe the chunks, summaries and scans lost on a bus; empty if there are none."""
+    """Describe the chunks, summaries and scans lost on a bus; return an empty string if none were lost."""
     streams = [patch.stream for patch in view.patches if patch.bus == bus.name]
     counts = [stream.assembler for stream in streams if stream is not None]
     for name, one, several in (

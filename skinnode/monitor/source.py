@@ -1,6 +1,6 @@
-"""Defines the interface of the data sources of the monitor and the 3-D view, and their data.
+"""Defines the data sources for the monitor and the 3-D view: their interface and their data.
 
-A source is a host in this process, a remote hand or a replayed recording. Sources take only the newest data
+A source is a host in this process, a remote hand or a replayed recording. Sources read only the newest data
 and never block the host.
 """
 
@@ -25,7 +25,7 @@ QUEUED_EVENTS: Final = 500
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Counters of the fields of a patch that the source has received."""
+    """Counters of a patch's fields, as received by the source."""
 
     received: int
     lost: int | None = None
@@ -49,7 +49,7 @@ class Snapshot:
     streams: Mapping[str, StreamStats]
     """Counters of each patch; empty for a remote hand, whose daemon does not send them."""
     away: str | None = None
-    """Reason why no data arrive from the daemon of a remote hand; None while they arrive."""
+    """Reason why no data is arriving from a remote hand's daemon; None while data is arriving."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class Source(Protocol):
 
     @property
     def no_commands(self) -> str | None:
-        """Reason why patches can be neither tared nor reset; None if they can."""
+        """Reason why patches cannot be tared or reset; None if they can."""
 
     @property
     def no_recording(self) -> str | None:

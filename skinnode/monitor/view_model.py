@@ -80,10 +80,10 @@ class BusView:
     level: Level
     words: tuple[str, ...]
     load: float | None
-    """Bus load over the last second, as a fraction of the bus capacity; None if the daemon of a remote hand
-    is away."""
+    """Bus load over the last second, as a fraction of the bus capacity; None if a remote hand's daemon is not
+    sending data."""
     frames_hz: float | None
-    """Frames per second; None for a remote hand, whose daemon does not send the number."""
+    """Frames per second; None for a remote hand, whose daemon does not send this number."""
     lost: int
     """Number of frames dropped by the kernel or the host."""
 
@@ -102,7 +102,7 @@ class View:
     latency_s: float | None
     latency_max_s: float | None
     away: str | None = None
-    """Reason why no data arrive from the daemon of a remote hand; None while they arrive."""
+    """Reason why no data is arriving from a remote hand's daemon; None while data is arriving."""
 
     @property
     def deepest_m(self) -> float:
@@ -175,7 +175,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
     health, field, arrivals = now.health[name], now.fields[name], now.arrivals[name]
     condition, level, words = judge_patch(health, _recent_losses(name, now, before))
     if now.away is not None:
-        words = ("daemon away",)  # the other words describe the past
+        words = ("daemon away",)  # the other faults are out of date
     surface = None if field is None else surface_of(field, upper_m(patch.layout))
     depth_m = depth_std_m = None
     if field is not None and surface is not None:
@@ -234,7 +234,7 @@ def upper_m(layout: LayoutConfig) -> Float:
 
 
 def _recent_losses(name: str, now: Snapshot, before: Snapshot) -> list[str]:
-    """Return a description of each kind of loss of a patch between two snapshots."""
+    """Describe each kind of data that a patch lost between two snapshots."""
     counts = [("fields", (now.arrivals[name].lost or 0) - (before.arrivals[name].lost or 0))]
     if name in now.streams:
         after, first = now.streams[name].assembler, before.streams[name].assembler

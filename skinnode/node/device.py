@@ -54,8 +54,8 @@ class CanopenDevice:
         send: Function that sends a frame, given its COB-ID and payload.
         serial: Serial number (0x1018:4), u32.
         memory: Non-volatile memory of the device, or None.
-        kind: Identifier of the patch's sizes and layout. Memory contents saved with another identifier are
-            not used.
+        kind: Identifier of the patch's dimensions and layout. Memory contents saved with another identifier
+            are not used.
         set_bit_rate: Function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:

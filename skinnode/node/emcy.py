@@ -17,8 +17,8 @@ from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Capacity of the queue of emergency messages. Messages wait during the inhibit time, in the STOPPED state,
-and while the bus refuses frames. If the queue is full, the oldest message is dropped."""
+"""Capacity of the emergency message queue. Messages wait during the inhibit time, in the STOPPED state, and
+while frames cannot be sent. If the queue is full, the oldest message is dropped."""
 _RESERVED_BIT: Final = 1 << 30
 
 
@@ -54,7 +54,7 @@ class EmcyProducer:
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report an error, immediately followed by its end.
+        """Report an error and then, immediately, its end.
 
         Args:
             code: Error code.
@@ -65,7 +65,9 @@ class EmcyProducer:
         self._send_end(code, t_ns)
 
     def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """Report an error that lasts until :meth:`clear`. Repeated calls with the same detail have no effect.
+        """Report an error that lasts until :meth:`clear` is called.
+
+        Repeated calls with the same detail have no effect.
 
         Args:
             code: Error code.
@@ -94,7 +96,7 @@ class EmcyProducer:
         self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send queued messages as the inhibit time allows. A message that the bus refuses stays queued."""
+        """Send queued messages as the inhibit time allows. A message that cannot be sent stays queued."""
         if not self._waiting:
             return
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
@@ -119,7 +121,7 @@ class EmcyProducer:
         self._queue(_message(code, register, detail), t_ns)
 
     def _send_end(self, code: EmcyCode, t_ns: int) -> None:
-        """Queue a message for the end of an error; its error register shows the remaining errors."""
+        """Queue a message that reports the end of an error; its error register shows the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
@@ -136,7 +138,7 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send queued messages. If the bus refuses a message, it is sent at a later timer event.
+        """Send queued messages. A message that cannot be sent is retried at a later timer event.
 
         No BusError is raised, because the caller is still handling the error that it reports.
         """

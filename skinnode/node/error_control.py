@@ -125,7 +125,7 @@ class ErrorControl:
     def _on_own(self, _: bytes, t_ns: int) -> None:
         """Report that another node has the same node-ID.
 
-        Every frame of the other node is counted as rejected. The error ends when the other node has been
+        Every frame from the other node is counted as rejected. The error ends when the other node has been
         silent for three heartbeat periods.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)

@@ -57,7 +57,7 @@ class Guarding:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """End guarding, because the node now sends heartbeats instead."""
+        """End guarding when the node starts to send heartbeats instead."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)

@@ -256,7 +256,7 @@ class BitRateChange:
         return self.deadline_ns != NO_DEADLINE_NS
 
     def cancel(self) -> None:
-        """Cancel the bit rate change because the node is being switched off."""
+        """Cancel the bit rate change when the node is switched off."""
         self.deadline_ns = NO_DEADLINE_NS
 
 

@@ -1,7 +1,7 @@
 """Non-volatile values of a node, and the interface to the memory that stores them.
 
-A memory saves a :class:`Kept` atomically: if saving is interrupted, it contains either all old or all new
-values. :mod:`skinnode.node.memory_file` implements a memory in a file.
+A memory saves a :class:`Kept` atomically: if saving is interrupted, it contains either all the old values or
+all the new ones. :mod:`skinnode.node.memory_file` implements a memory in a file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Kept:
     """Contents of a memory: the non-volatile values of a node."""
 
     patch: str = ""
-    """Identifier of the patch's sizes and layout. Other patches must not use the contents."""
+    """Identifier of the patch's dimensions and layout. Other patches must not use the contents."""
     node_id: int | None = None
     """Node-ID stored by LSS, 1 to 127, or 255 for no node-ID; None if LSS has stored nothing."""
     bit_rate_bps: int | None = None

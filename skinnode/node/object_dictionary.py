@@ -55,7 +55,7 @@ class Lengths(NamedTuple):
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check the length received so far of a value that may be incomplete.
+        """Check the number of bytes received so far for a value that may be incomplete.
 
         Raises:
             Refused: If the length exceeds the maximum.

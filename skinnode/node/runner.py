@@ -64,7 +64,7 @@ class NodeRunner:
         self.bus_error = ""
         """One-line description of the first error in the latest series of bus errors; empty if there has been
         none."""
-        self._deadlines_ns = [NO_DEADLINE_NS] * len(self.nodes)  # at the end of the last turn
+        self._deadlines_ns = [NO_DEADLINE_NS] * len(self.nodes)  # as of the end of the last turn
         self._heard = 0
         self._bus_state = BusState.ACTIVE
         # Number of frames that the port had sent when bus-off began. Any frame sent later proves recovery.

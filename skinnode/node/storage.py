@@ -1,4 +1,4 @@
-"""Storage of the parameters, the baseline and the LSS configuration of a node.
+"""Stores a node's parameters, baseline and LSS configuration.
 
 This module implements objects 0x1010 (store parameters), 0x1011 (restore default parameters) and 0x1020
 (verify configuration) of CiA 301 v4.2. A *parameter* is an object that a client can write and read back.
@@ -43,7 +43,7 @@ class Storage:
         services: Resources that all services of the node share.
         memory: Memory of the node, or None. Without a memory, 0x1010 and 0x1011 read as 0 and refuse writes
             (CiA 301).
-        patch: Sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
+        patch: Identifier of the patch's dimensions and layout; see :class:`~skinnode.node.memory.Kept`.
     """
 
     def __init__(self, services: NodeServices, memory: Memory | None, patch: str) -> None:
@@ -168,7 +168,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """End the given faults and report their end."""
+        """Clear the given faults and report that they have ended."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -184,7 +184,7 @@ class Storage:
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
             # With this command, the user accepts the current parameters, so any faults in the memory's
-            # contents end. Saving the baseline automatically does not end them.
+            # contents are cleared. Saving the baseline automatically does not clear them.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard

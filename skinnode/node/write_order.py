@@ -31,8 +31,8 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
         values: Saved bytes, by index and sub-index.
 
     Returns:
-        Objects that refused their values and keep their defaults. A mapping that has a refused entry keeps
-        its entire default.
+        Objects that refused their values and keep their defaults. If an entry of a mapping is refused, the
+        whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]

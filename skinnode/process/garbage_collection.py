@@ -17,7 +17,7 @@ def without_long_collections() -> Iterator[None]:
     objects that become cyclic garbage during the block are freed after it.
 
     If the program has already excluded objects, with an outer block or with :func:`gc.freeze`, all objects
-    stay excluded after the block: the outer block may still need it.
+    stay excluded after the block, because the outer block may not have ended.
     """
     gc.collect()
     nested = gc.get_freeze_count() > 0

@@ -1,4 +1,4 @@
-"""Shuts down programs in an orderly way when a signal stops them."""
+"""Shuts programs down cleanly when they receive a termination signal."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
     on exit.
 
     Raises:
-        ValueError: The function was not called on the main thread.
+        ValueError: If the function is not called on the main thread.
     """
     stop = SignalEvent()
 

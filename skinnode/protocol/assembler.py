@@ -435,7 +435,7 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard all stored codes because a scan was discarded.
+        """Discard all stored codes after a scan has been discarded.
 
         ``doubt`` is true if the scan may have announced a new baseline.
         """

@@ -213,7 +213,7 @@ def _values(profile: PatchProfile) -> _Macros:
 
 
 def _layout(layout: PatchLayout) -> str:
-    """Return the layout's macros and the coordinates, which only the requesting source file compiles."""
+    """Return the layout's macros and the coordinate array, which is compiled only on request."""
     (resistivity,) = struct.unpack("<I", struct.pack("<f", layout.resistivity_ohm_per_m))
     coordinates = pack_coordinates(layout)
     rows = [coordinates[at : at + _COORDINATE_BYTES] for at in range(0, len(coordinates), _COORDINATE_BYTES)]

@@ -32,7 +32,7 @@ def unpack_coordinates(
 ) -> PatchLayout:
     """Return the layout given by the contents of 0x2300.
 
-    Raises ConfigError if the length does not match the sizes in ``profile``, and ValueError if the
+    Raises ConfigError if the length does not match the dimensions in ``profile``, and ValueError if the
     coordinates do not form a valid layout.
     """
     upper, lower = profile.rows * profile.upper_electrodes, profile.columns * profile.lower_electrodes

@@ -11,7 +11,7 @@ The 16-bit time consists of bits 6 to 21 of the 32-bit time. It wraps every 4.2 
 upper bits if it can predict the device time to within 2 s.
 """
 TIME_SHIFT: Final = 6
-"""Number of bits by which a time in µs is shifted right to give a time in steps of 64 µs."""
+"""Number of bits by which a time in µs is shifted right to convert it to steps of 64 µs."""
 TIME_WRAP_US: Final = TIME_STEP_US << 16
 """Period in µs after which the 16-bit device time wraps; about 4.2 s."""
 

@@ -27,7 +27,7 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all payloads because a scan that may have changed them was lost."""
+        """Discard all payloads after the loss of a scan that may have changed them."""
         self._payloads, self._decoded = [None] * self._profile.n_chunks, None
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:

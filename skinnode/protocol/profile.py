@@ -1,4 +1,4 @@
-"""Sizes of a patch and its wire format.
+"""Dimensions and wire format of a patch.
 
 **Classic CAN.** A patch sends the U×K codes of a scan in *chunks* (TPDO1). A chunk consists of a u8 chunk
 index, a u8 scan counter, and 3 codes of 16 bits or 2 codes of 24 bits. Codes are sent in row-major order,
@@ -43,7 +43,7 @@ _MOST_SUBINDICES: Final = 254  # sub-index 255 is reserved by CiA 301
 
 @dataclass(frozen=True, slots=True)
 class PatchProfile:
-    """Sizes of a patch and its wire format.
+    """Dimensions and wire format of a patch.
 
     Raises:
         ConfigError: If a number of wires, electrodes or PDOs is out of range; if the code width is neither 16
@@ -55,7 +55,7 @@ class PatchProfile:
     columns: int
     """Number of lower wires, K."""
     upper_electrodes: int
-    """Number N of electrodes per upper wire."""
+    """Number of electrodes per upper wire, N."""
     lower_electrodes: int
     """Number of electrodes per lower wire, M."""
     code_bits: int = 16

@@ -24,8 +24,8 @@ class Scan:
     scan: int
     """Scan counter without wrap-around. It starts at the first counter received and increases."""
     complete: bool
-    """Whether the codes are known to match those that the node packed: all chunks arrived or are known to be
-    unchanged, and, in a checked stream, the check passed."""
+    """Whether the codes are known to match the codes that the node packed: all chunks arrived or are known to
+    be unchanged, and, in a checked stream, the check passed."""
     chunks_expected: int
     """Number of chunks sent, according to the summary; the number of chunks in a full scan if the summary was
     lost."""
@@ -94,7 +94,7 @@ class AssemblerStats:
     bad_length: int
     """* Frames with the wrong length for a chunk or a summary."""
     bad_index: int
-    """* Chunks that the patch does not have, and summaries that announce too many chunks."""
+    """* Chunks with an invalid chunk index, and summaries that announce too many chunks."""
     bad_counter: int
     """* Frames with a scan counter outside the range of the SYNC counter."""
     bad_form: int

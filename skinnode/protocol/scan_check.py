@@ -41,8 +41,8 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
        another scan fail the check, because their scan counter or device time differs.
 
     The check detects every error burst of up to 16 bits, such as a single wrong 16-bit code, and every odd
-    number of bit errors. With up to 4,087 bytes of codes, it also detects every double bit error. Of all
-    other errors, one in 65,536 goes undetected.
+    number of bit errors. With up to 4,087 bytes of codes, it also detects every double bit error. One in
+    65,536 of all other errors goes undetected.
 
     Args:
         check_of_codes: Result of :func:`check_of_codes`.

@@ -16,7 +16,7 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Number of leading bytes of a summary that are covered by the scan check."""
+"""Number of leading summary bytes that are covered by the scan check."""
 
 
 class SummaryFlag(enum.IntFlag):
@@ -61,7 +61,7 @@ PHASES: Final = 3
 """Number of conversion phases, not counting 0. A phase can be compared only with the phase of the previous
 scan: after missed scans, the phase may have wrapped."""
 PHASE_SHIFT: Final = 6
-"""Number of the lowest bit of the conversion phase in the flags."""
+"""Position of the conversion phase's lowest bit in the flags."""
 
 _CHECKED: Final = int(SummaryFlag.CHECKED)  # ten times as fast to test as an enum flag
 

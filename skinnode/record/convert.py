@@ -116,7 +116,7 @@ def _share_journal(source: Path, target: Path) -> bool:
 
 
 def ending_in(suffixes: tuple[str, ...]) -> str:
-    """Return the allowed suffixes of a file as the text of an error message."""
+    """Return a list of the allowed file suffixes for an error message."""
     return f"a file ending in {', '.join(suffixes[:-1])} or {suffixes[-1]}"
 
 

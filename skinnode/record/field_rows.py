@@ -62,8 +62,8 @@ class FieldRow:
 
     patch: str
     columns: Columns
-    """Values by name of all columns in :data:`NUMBERS`, :data:`TEXTS`, :data:`WIRES`, :data:`POINTS` and
-    :data:`CROSSINGS`."""
+    """Values, by column name, of all columns in :data:`NUMBERS`, :data:`TEXTS`, :data:`WIRES`, :data:`POINTS`
+    and :data:`CROSSINGS`."""
     contacts: list[Columns] | None = None
     """Contacts; None if unknown."""
     faults: list[Columns] | None = None

@@ -53,7 +53,7 @@ def followed(recorder: Recorder, host: Host) -> Iterator[None]:
 def _watch(recorder: Recorder, host: Host, events: EventSubscription, over: threading.Event) -> None:
     """Record each event immediately, and record the health every second and at the end.
 
-    The end is the end of the block or of the host, whichever comes first.
+    Recording ends when the block or the host ends, whichever comes first.
     """
     due_s = clock.monotonic()
     ended = False

@@ -70,14 +70,14 @@ COMPLAINTS_KEPT: Final = 100
 
 _MOST: Final = 2**63 - 1
 _MOST_SYNCS: Final = 2**53
-"""Maximum number of a SYNC; numbers of later ones also fit in 64 bits."""
+"""Maximum accepted SYNC number, chosen so that the numbers of later SYNCs also fit in 64 bits."""
 _LONGEST_HEADER: Final = 32 << 20
 """Maximum length of the first line in bytes. The layout files of a hundred of the largest patches fit."""
 _LONGEST_LINE: Final = 2 << 20
 """Maximum length of a line in bytes. An event containing the baseline and layout of the largest patch fits; a
 longer line is read as several lines."""
 _BESIDE_FILE: Final = {"coordinates"}
-"""Keys that a patch's layout table may contain next to the name of a layout file."""
+"""Keys that a patch's layout table may contain in addition to the name of a layout file."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -118,10 +118,10 @@ def _hand_of(table: Mapping[str, Any], where: str) -> HandConfig:
 
 
 def _layoutless(table: Mapping[str, Any]) -> frozenset[str]:
-    """Return the patches whose layout file an older version has left out.
+    """Return the names of the patches whose layout file was omitted by an older version.
 
-    Only the name of a layout file leaves such a table behind: no key allowed next to it, except
-    ``coordinates``, has a value.
+    The older version removed the file name from the layout table. A table without keys other than
+    ``coordinates`` must therefore have contained a file name.
     """
     patches = [patch for patch in table["patches"] if "layout" in patch]
     return frozenset(patch["name"] for patch in patches if not {*patch["layout"]} - _BESIDE_FILE)
@@ -132,7 +132,7 @@ def facts_table(facts: NodeFacts, planned: PatchLayout) -> dict[str, Any]:
 
     Args:
         facts: The facts.
-        planned: Layout that a reader builds from its hand; the object contains the layout if it differs.
+        planned: Layout that a reader builds from the hand; the object contains the layout if it differs.
     """
     layout = facts.layout
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
@@ -203,7 +203,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], l
     try:
         with path.open("rb") as file:
             kept: list[bytes] = []
-            first = file.read(1)  # a file of another kind is not read further
+            first = file.read(1)  # stop reading if this is not a journal
             if first == b"{":
                 first += file.readline(_LONGEST_HEADER)
             lines = chain((first,), iter(lambda: file.readline(_LONGEST_LINE), b""))

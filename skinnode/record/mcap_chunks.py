@@ -30,7 +30,7 @@ _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _MOST_CHUNK: Final = 1 << 26
 """Maximum uncompressed chunk size in bytes; the usual size is 1 MiB. A larger size indicates damage."""
 TRUNCATED: Final = "truncated"
-"""Description of damage in which a file ends in the middle of a record."""
+"""Description of the damage if a file ends in the middle of a record."""
 _AT_THE_END: Final = (Opcode.DATA_END, Opcode.FOOTER)
 
 

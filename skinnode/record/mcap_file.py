@@ -146,7 +146,7 @@ class McapFile:
         self._write(self._topics.events, LOG, log_message(event, t_ns), t_ns, log_ns)
 
     def flush(self, *, to_disk: bool) -> None:
-        """End the chunk and pass it to the operating system; it is then kept even if the process is killed.
+        """End the chunk and pass it to the operating system, so that it survives if the process is killed.
 
         Args:
             to_disk: Whether to wait until the file is on disk, where it would survive a power failure.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _RECEIVED_TOPICS = ("from_can_bus", "from_can_bus_fd")
 _SENT_TOPICS = ("to_can_bus", "to_can_bus_fd")
-"""Last parts of the ros2_socketcan topic names for sent frames."""
+"""Last components of the ros2_socketcan topic names for sent frames."""
 
 
 class McapReader:

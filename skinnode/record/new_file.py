@@ -1,4 +1,4 @@
-"""Completes a new file at the end of a block, or deletes it if the block raises."""
+"""Completes a new file at the end of a block, or deletes it if the block raises an exception."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 
 class NewFile(Protocol):
-    """File that its constructor has created."""
+    """File on disk, created by the constructor."""
 
     def close(self) -> None:
         """Complete and close the file. Raises OSError if writing fails."""
@@ -25,8 +25,8 @@ def kept_if_complete(file: _File) -> Iterator[_File]:
     """Yield ``file`` and complete it at the end of the block; delete it if an exception is raised.
 
     Args:
-        file: The file. Its constructor must fail if the file exists, so that no file of another process is
-            deleted.
+        file: The file. Its constructor must fail if the file exists, so that a file of another process is
+            never deleted.
 
     Raises:
         OSError: The rest of the file cannot be written.

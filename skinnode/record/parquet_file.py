@@ -23,7 +23,7 @@ _KEY: Final = b"skinnode"
 def require_pyarrow(path: Path) -> None:
     """Raise ConfigError if pyarrow is not installed."""
     if find_spec("pyarrow") is None:
-        allowed = "the package of the extra parquet (install: sh install.sh parquet)"
+        allowed = "the package of the parquet extra (install: sh install.sh parquet)"
         raise ConfigError(str(path), Shown("no package pyarrow"), allowed)
 
 
@@ -47,7 +47,7 @@ class ParquetFile:
 
         schema = _schema().with_metadata({_KEY: FORMAT.encode(), b"skinnode.hand": hand.encode()})
         self._schema = schema
-        # dictionary-encoding measured numbers saves no space and takes four times as long as all else
+        # dictionary-encoding measured numbers saves no space and takes four times as long as everything else
         texts = ["patch", *TEXTS]
         create_binary(path).close()
         self._path = path

@@ -42,7 +42,7 @@ If this process crashes, at most the last 0.25 s of the recording are lost.
 """
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s. In a power failure, about the last second of the recording is lost. Each
+"""Interval (s) between fsync calls. In a power failure, about the last second of the recording is lost. Each
 fsync call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000

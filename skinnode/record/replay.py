@@ -1,7 +1,7 @@
 """Replays a recording and solves its scans with the code that decodes live frames.
 
-The dispatcher, assembler, decoder, stream, solver and publisher are those of the host, but run in a single
-thread: each scan is solved when its last frame is dispatched.
+A replay uses the host's own dispatcher, assembler, decoder, stream, solver and publisher, but runs them in a
+single thread: each scan is solved when its last frame is dispatched.
 
 The fields are identical to those of the live run, bit for bit, if these conditions are met:
 

@@ -14,9 +14,9 @@ has only one daemon. ``description`` describes the hand to programs, and ``disco
 
 **Rules.** The host never waits: it offers fields to a bounded queue. The daemon never waits for a program:
 Zenoh drops messages for a connection whose queue is full. A program never delays its connection: its queue
-drops the oldest message. Each dropped field appears as a gap in its patch's sequence numbers.
-A program passes on only data of the daemon run that it has a description of. A command that its program has
-given up is not executed.
+drops the oldest message. Each dropped field appears as a gap in its patch's sequence numbers. A program
+passes on data only from the daemon run whose description it has received. A command that the program has
+abandoned is not executed.
 
 This package requires the extra ``zenoh``.
 """

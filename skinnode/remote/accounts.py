@@ -18,7 +18,7 @@ class PatchCounts:
     runs: int
     """Number of daemon runs from which fields have arrived."""
     sequence: int
-    """Sequence number of the newest field; 0 before the first."""
+    """Sequence number of the newest field; 0 before the first field."""
     published: int
     """Number of fields sent in the daemon's current run, as counted by the daemon in its newest report."""
     delay_s: float
@@ -40,8 +40,8 @@ class PatchAccount:
     def add(self, sent: SendStamp, delay_ns: int, t_receive_ns: int) -> bool:
         """Count a field; return whether it is newer than all earlier fields of its run.
 
-        A field with a different ``started_ns`` begins a new run. The order of ``started_ns`` has no meaning,
-        because the daemon's clock may have been set back.
+        A field with a different ``started_ns`` begins a new run. The order of the ``started_ns`` values is
+        meaningless, because the daemon's clock may have been set back.
 
         Args:
             sent: Sequence number and times of the field.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Claim(Closing):
-    """Zenoh session of a hand's only daemon, open until :meth:`close`.
+    """Zenoh session of a hand's only daemon, open until :meth:`close` is called.
 
     Two daemons that start at the same moment may both be refused. Daemons that cannot reach each other, such
     as daemons on two machines whose router is not running, are both accepted.
@@ -53,7 +53,7 @@ class Claim(Closing):
             if keys.zid_of(token) == zid or HandTopics.base_of(other) != base:
                 continue
             if other == self.hand.name:
-                allowed = "a hand that no other daemon publishes (end the other daemon, or set another name)"
+                allowed = "a hand that no other daemon publishes (stop the other daemon, or set another name)"
             else:
                 allowed = f"a name that differs from the published hand {other!r} in letters or digits"
             raise ConfigError("name", self.hand.name, allowed, where=self.hand.where("name"))

@@ -32,10 +32,10 @@ class _Arrival(NamedTuple):
 
 
 class CommandServer:
-    """Accepts commands from construction until :meth:`close`.
+    """Accepts commands from construction until :meth:`close` is called.
 
-    A program gives up a command :data:`~skinnode.remote.commands.REPLY_S` after the command's time limit. A
-    command whose turn comes too late is refused, so no command is executed that its program has given up.
+    A program abandons a command :data:`~skinnode.remote.commands.REPLY_S` after the command's time limit. A
+    command that has been queued for too long is refused, so an abandoned command is never executed.
 
     Args:
         session: Session of the daemon.
@@ -92,10 +92,10 @@ class CommandServer:
         deadline_s = tare_deadline_s(self._host.hand, request.deadline_s)
         left_s = deadline_s + REPLY_S / 2 - request.waited_s(arrived_ns)
         if self._over.is_set():
-            raise SkinError(f"{command} of {patch!r} not executed: the daemon is ending")
+            raise SkinError(f"{command} of {patch!r} not executed: the daemon is shutting down")
         if left_s < 0:
-            raise SkinError(f"{command} of {patch!r} not executed: its turn came too late; try again")
-        _log.info("%s: %s, commanded by a program", patch, command)
+            raise SkinError(f"{command} of {patch!r} not executed: it was queued for too long; try again")
+        _log.info("%s: %s, requested by a program", patch, command)
         if command == "tare":
             self._host.tare(patch, deadline_s=min(deadline_s, left_s), cancelled=self._over.is_set)
         else:

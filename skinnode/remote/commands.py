@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import zenoh
 
 REPLY_S: Final = 2.0
-"""Time limit for a reply, s, in addition to the time limit of the command. At most half of this time may pass
-while other commands are executed."""
+"""Time limit for a reply, in s, in addition to the time limit of the command. At most half of this time may
+pass while other commands are executed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Request:
     patch: str
     """Name of the patch."""
     deadline_s: float | None = None
-    """Time limit of the command, in s; that of a tare by default."""
+    """Time limit of the command, in s; by default, the time limit of a tare."""
     boot_id: str = field(default_factory=boot_id)
     """Boot ID of the program's operating system."""
     sent_ns: int = field(default_factory=clock.monotonic_ns)
@@ -51,11 +51,11 @@ class Request:
             raise SkinError(f"request: got {data[:40]!r}, must be JSON with command and patch") from None
 
     def waited_s(self, arrived_ns: int) -> float:
-        """Return the time since the program sent the command, s, on this computer's monotonic clock.
+        """Return the time in s since the program sent the command, on this computer's monotonic clock.
 
         Args:
-            arrived_ns: Time at which the command arrived, in ns; counts for a program on another machine. A
-                daemon that was suspended notices the arrival late.
+            arrived_ns: Time at which the command arrived, in ns; used if the program is on another machine. A
+                daemon that was suspended registers the arrival late.
         """
         sent_ns = self.sent_ns if self.boot_id == boot_id() != "" else arrived_ns
         return (clock.monotonic_ns() - min(sent_ns, arrived_ns)) * 1e-9

@@ -34,7 +34,7 @@ class Description:
     """Facts about a published hand that do not change while it runs."""
 
     hand: HandConfig
-    """Configuration of the hand, without file names; programs see ``guest_sends`` as ``sdo``."""
+    """Configuration of the hand, without file names; programs always receive ``guest_sends`` as ``sdo``."""
     layouts: Mapping[str, PatchLayout]
     """Electrode layout of each patch, by patch name."""
     boot_id: str
@@ -42,7 +42,7 @@ class Description:
     commands: bool
     """Whether the daemon accepts commands."""
     started_ns: int
-    """Unix time at which the daemon started, ns; identifies its run, as in its fields and reports."""
+    """Unix time at which the daemon started, in ns; identifies the daemon's run in its fields and reports."""
 
     def agrees_with(self, other: Description) -> bool:
         """Return whether both descriptions have the same configuration and the same electrodes."""

@@ -52,7 +52,7 @@ class _Item(NamedTuple):
 
 
 class Receiver:
-    """Queues messages from construction; from :meth:`start` until :meth:`close`, a thread passes them on.
+    """Queues messages from construction. A thread passes them on from :meth:`start` until :meth:`close`.
 
     Args:
         session: Session of the program.
@@ -84,11 +84,11 @@ class Receiver:
         ]
 
     def start(self) -> None:
-        """Start to pass on messages."""
+        """Start passing on messages."""
         self._thread.start()
 
     def follow(self, description: Description, run: int) -> None:
-        """Stamp the next fields as fields of the daemon that sent ``description``.
+        """Stamp subsequent fields as coming from the daemon that sent ``description``.
 
         Args:
             description: Description, whose boot ID determines how times are converted.
@@ -164,7 +164,7 @@ class Receiver:
         self._events_of = gid, sequence
 
     def _offset_ns(self, wall_minus_mono_ns: int) -> int:
-        """Return this machine's monotonic clock minus the host's, ns, derived from both wall clocks."""
+        """Return this machine's monotonic clock minus the host's, in ns, derived from both wall clocks."""
         if self._same_clock:
             return 0
         return wall_minus_mono_ns - (clock.time_ns() - clock.monotonic_ns())

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     import zenoh
 
 SILENT_S: Final = 1.0
-"""Time without a health report after which the daemon is considered silent, s. The daemon sends four reports
-per second."""
+"""Time without a health report after which the daemon is considered silent, in s. The daemon sends four
+reports per second."""
 _RESET_S: Final = 1.0
 _UNKNOWN: Final = -1
-"""Number of arrivals after which the next turn requests a description."""
+"""Number of described arrivals that makes the next turn request a new description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +57,9 @@ class RemoteHand(RunningHand, Closing):
 
     If the daemon ends or the connection fails, subscriptions wait, :meth:`health` reports every patch as lost
     with the reason, and :attr:`away` gives the reason. The connection is re-established in the background.
-    Only data of the run whose description has arrived are passed on. If a returning daemon has another hand
-    file, or a version of skinnode with different messages, its data are never passed on: subscriptions raise
-    an error, and the hand remains away.
+    Only data from the run whose description has arrived are passed on. If a returning daemon has a different
+    hand file, or a version of skinnode with different messages, its data are never passed on: subscriptions
+    raise an error, and the hand remains away.
 
     Threads: any thread may call any method.
 
@@ -259,7 +259,7 @@ class RemoteHand(RunningHand, Closing):
         self._receiver.follow(description, self._run)
 
     def _refuse(self, error: SkinError) -> None:
-        """Pass on nothing from now on, and give ``error`` as the reason wherever a program may look."""
+        """Stop passing on data, and report ``error`` to subscriptions, in :attr:`away` and as an event."""
         self._refusal, self._was_away = error, True
         self._publisher.fail(error)
         self._events.publish(HealthEvent(clock.monotonic_ns(), "host", "away", str(error)))
@@ -267,8 +267,8 @@ class RemoteHand(RunningHand, Closing):
     def _is_current(self, started_ns: int) -> bool:
         """Return whether a message is from the run that has been described.
 
-        If another run sends while the described one is silent, its description is requested: a daemon that is
-        about to end may have answered the previous request.
+        If messages arrive from another run while the described run is silent, a new description is requested,
+        because the previous request may have been answered by a daemon that was about to end.
         """
         if self._refusal is None and started_ns == self._description.started_ns:
             return True

@@ -1,8 +1,8 @@
 """Opens Zenoh sessions for daemons and programs.
 
 Without a router, daemons and programs on the same machine find each other on :data:`PORTS` fixed ports of
-127.0.0.1: each daemon listens on the first free port, and daemons and programs connect to all of them. No
-broker and no multicast are needed. With a router, a daemon also connects to the router, and a program
+127.0.0.1: each daemon listens on the first free port, and daemons and programs connect to all of them.
+Neither a broker nor multicast is needed. With a router, a daemon also connects to the router, and a program
 connects only to the router.
 """
 
@@ -99,7 +99,7 @@ def host_of(option: str, endpoint: str) -> str:
 
 
 def require_zenoh(option: str) -> None:
-    """Check that the packages of the extra ``zenoh`` are installed.
+    """Check that the packages of the ``zenoh`` extra are installed.
 
     Args:
         option: Option that requires them; used in the error message.
@@ -108,7 +108,7 @@ def require_zenoh(option: str) -> None:
         ConfigError: A package is missing.
     """
     if find_spec("zenoh") is None:
-        allowed = "the packages of the extra zenoh (install: sh install.sh zenoh)"
+        allowed = "the packages of the zenoh extra (install: sh install.sh zenoh)"
         raise ConfigError(option, Shown("no package eclipse-zenoh"), allowed)
     require_mcap(option)
 

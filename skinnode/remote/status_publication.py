@@ -64,7 +64,7 @@ class StatusPublication:
         self._due_s = 0.0
         self._over = clock.event()
         self.wall_minus_mono_ns = clock.time_ns() - clock.monotonic_ns()
-        """Unix time minus the monotonic clock, ns, as of the newest report."""
+        """Unix time minus the monotonic clock, in ns, as of the newest report."""
         self._thread = clock.thread(target=self._run, name="publish status")
         self._thread.start()
 

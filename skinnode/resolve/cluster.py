@@ -27,12 +27,12 @@ _GONE_S: Final = 20.0
 def require_dask() -> None:
     """Raise ConfigError if dask.distributed is not installed."""
     if find_spec("distributed") is None:
-        allowed = "the package of the extra cluster (install: sh install.sh cluster)"
+        allowed = "the package of the cluster extra (install: sh install.sh cluster)"
         raise ConfigError("--scheduler", Shown("no package distributed"), allowed)
 
 
 class Cluster(Closing):
-    """Workers of a Dask cluster. All workers must have this version of skinnode and see the same files.
+    """Workers of a Dask cluster. All workers must have this version of skinnode and access to the same files.
 
     Args:
         address: Address of the scheduler.

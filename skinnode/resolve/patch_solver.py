@@ -40,7 +40,7 @@ class SolveSummary:
     deepest_m: float = 0.0
     """Largest displacement into the skin, in m."""
     std_sum_m: float = 0.0
-    """Sum over the fields of the median standard deviation of z, in m; unknown deviations are left out."""
+    """Sum, over all fields, of the median standard deviation of z, in m; unknown deviations are left out."""
     known_std: int = 0
     """Number of fields in ``std_sum_m``."""
     cpu_s: float = 0.0

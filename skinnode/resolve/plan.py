@@ -55,8 +55,8 @@ def make_plan(
             recording are divided among several units, each of which must read the whole recording.
 
     Raises:
-        ConfigError: Two results would have the same name, two variants give the same hand, or a setting is
-            not allowed for a hand.
+        ConfigError: Two results would have the same name, two variants result in the same hand, or a setting
+            is not allowed for a hand.
     """
     jobs: list[Job] = []
     groups = -(-workers // len(recordings))
@@ -86,7 +86,7 @@ def file_name(stem: str, variant: Variant) -> str:
 
 
 def _require_different(variants: Sequence[Variant], hands: Sequence[HandConfig]) -> None:
-    """Raise ConfigError if two variants give the same hand, because they would have the same results."""
+    """Raise ConfigError if two variants result in the same hand, because they would have the same results."""
     seen: dict[str, Variant] = {}
     for variant, hand in zip(variants, hands, strict=True):
         before = seen.setdefault(hand.model_dump_json(), variant)

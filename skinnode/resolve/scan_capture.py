@@ -26,7 +26,7 @@ Place = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class CapturedFacts:
-    """Facts from which a new solver is made for the following scans of a patch.
+    """Facts from which a new solver is created for the following scans of a patch.
 
     The facts are stored as in a journal. When the facts are rebuilt, patches with the same layout share the
     layout's tables.

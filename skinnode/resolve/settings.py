@@ -95,7 +95,7 @@ def _check(key: str) -> None:
 
 
 def _patch_and_key(key: str) -> tuple[str, list[str]]:
-    """Split ``patches.NAME.KEY``; the name may contain dots, because patches are not named after keys."""
+    """Split ``patches.NAME.KEY``; NAME may contain dots and ends before the first patch key."""
     parts = key.split(".")[1:]
     for at in range(1, len(parts)):
         if parts[at] in PatchConfig.model_fields:
@@ -150,7 +150,7 @@ def _split(text: str) -> list[str]:
 
 
 def capture_hand(hand: HandConfig) -> HandConfig:
-    """Return the hand without solver settings; variants with the same result share captured scans."""
+    """Return the hand without solver settings; variants with equal results share captured scans."""
     plain = PatchConfig(name="any", node_id=1)
     same = {"calibration": plain.calibration, "tolerances": plain.tolerances}
     patches = tuple(patch.model_copy(update=same) for patch in hand.patches)

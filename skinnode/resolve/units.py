@@ -1,4 +1,4 @@
-"""Units of work. A unit can run in any process that sees the recordings and the work folder."""
+"""Units of work. A unit can run in any process that has access to the recordings and the work folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Unit:
     def key(self) -> str:
         """Hash of everything that determines the result, including the software and the hand's files.
 
-        After an update or a change of a file, an interrupted run therefore does not continue with old parts.
+        After a software update or a file change, an interrupted run therefore does not reuse outdated parts.
         """
         content = [type(self).__name__, repr(self.recording), self.hand.model_dump_json()]
         content += [repr(sorted(_own_identity().items())), *_hashes_of_files(self.hand)]
@@ -177,7 +177,8 @@ class WriteResult(Unit):
     def run(self, parts: PartFiles) -> None:
         """Write the part, then the file.
 
-        In this order, a file without a part is always a foreign file, even if this process is killed.
+        With this order, a file without a part cannot have been written by this unit, even if the process was
+        killed.
         """
         with (
             new_result(self.recording, self.hand, self.solved, self.target, parts),
@@ -204,8 +205,8 @@ def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> 
         worker: Name of this worker, for error messages.
 
     Raises:
-        SkinError: This process has different software, cannot see the work folder or finds different files,
-            or the unit fails.
+        SkinError: This process has different software, cannot access the work folder or finds different
+            files, or the unit fails.
     """
     found = difference(expected, _own_identity())
     if found is not None:
@@ -215,7 +216,7 @@ def run_unit(unit: Unit, folder: str, expected: dict[str, str], worker: str) -> 
             f"worker {worker}: cannot see the folder {folder}; use a folder that all workers share"
         )
     parts = PartFiles(Path(folder))
-    fresh = replace(unit)  # computes its key in this process, from the files that it sees
+    fresh = replace(unit)  # computes its key in this process, from the files available here
     if fresh.key != unit.key:
         raise SkinError(
             "a file that the hand names is not the file that the command started with; run the command "

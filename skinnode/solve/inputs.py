@@ -17,10 +17,11 @@ NOISE_MAX: Final = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeMap:
-    """Mapping from a converter's codes 0 to ``steps`` to resistances: R = (lo + code · step) · R0 · gain."""
+    """Mapping from converter codes (0 to ``steps``) to resistances: R = (lo + code · step) · R0 · gain."""
 
     baseline_ohm: Float
-    """(U, K) baselines R0, ohm; the codes of a crossing are invalid if its R0 is not positive and finite."""
+    """(U, K) baselines R0, in ohms; the codes of a crossing are invalid if its R0 is not positive and
+    finite."""
     lo: float
     """Ratio R / R0 at code 0."""
     step: float
@@ -28,7 +29,7 @@ class CodeMap:
     steps: int
     """Largest valid code."""
     rounding_ohm: Float
-    """(U, K) standard deviation of the quantization error, ohm."""
+    """(U, K) standard deviation of the quantization error, in ohms."""
     relative_noise: float
     """Relative standard deviation of the resistances before quantization."""
     gain: Float | None = None
@@ -73,7 +74,7 @@ class CodeDecoder:
 
         Args:
             codes: (U, K) codes. If a host passes the read-only array of the last frame again, because the
-                node has sent no new codes, the result is that of the last call.
+                node has sent no new codes, the last result is returned again.
 
         Returns:
             Read-only resistances (U, K) in ohms, NaN where a code is invalid; a read-only mask (U, K) of the

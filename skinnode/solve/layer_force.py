@@ -10,9 +10,9 @@ modulus G by
 
 where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, section 5.8; the thin-layer limit
 F ∝ G a⁴ δ / t³ is from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ,
-the ratio of the two forces depends only on a/t. The force on a real layer is between that on the half-space
-and that on the bonded layer. On thick layers, the half-space model needs negative loads, which cancel part of
-the positive loads; the sum of the positive loads is therefore a second bound.
+the ratio of the two forces depends only on a/t. The force on a real layer is between the forces on the
+half-space and on the bonded layer. On thick layers, the half-space model needs negative loads, which cancel
+part of the positive loads; the sum of the positive loads is therefore a second bound.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def stiffening(radius_m: float, thickness_m: float) -> float:
 
 
 def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m: float) -> float:
-    """Return the force, N, that indents a bonded layer by ``depth_m`` in a circular contact.
+    """Return the force, in N, that indents a bonded layer by ``depth_m`` in a circular contact.
 
     Args:
         rubber: The material.
@@ -62,7 +62,7 @@ def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m:
 
 
 def layer_std_n(bonded_n: float, force_n: float) -> float:
-    """Return a standard deviation, N, that covers the force on a bonded layer.
+    """Return a standard deviation, in N, that covers the force on a bonded layer.
 
     Args:
         bonded_n: Force on a bonded layer, in N.

@@ -11,8 +11,8 @@ A block is rejected if the skin moved. Two tests detect motion:
 
 - Slow motion, a step or a lost scan makes the variances of the two contrasts unequal. Slow motion makes the
   quadratic contrast larger than the cubic.
-- Motion gives the contrasts of neighbouring crossings the same sign, whereas noise gives them independent
-  signs.
+- With motion, the contrasts of neighbouring crossings have the same sign; with noise, their signs are
+  independent.
 
 The variance of a block is a robust mean over its readings (Huber, Robust Statistics, 1981, proposal 2), which
 limits the influence of bad readings and of a touch on a few wires. The estimate is the median over the last
@@ -45,7 +45,7 @@ With an odd number, the median is the value of one block.
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
-"""Number of frames skipped once a full window agrees with its last block.
+"""Number of frames skipped after a block that agrees with a full window.
 
 This is also the maximum number of frames skipped after rejected blocks. Without skipping, the noise estimate
 would take 8 % of the computing time for a patch at rest.
@@ -176,9 +176,9 @@ def assess_block(
     """Return the noise variances of a block of four frames.
 
     Args:
-        frames: (4, U, K) resistances, ohm; NaN if invalid.
+        frames: (4, U, K) resistances, in ohms; NaN if invalid.
         noise: (U, K) stated relative standard deviation of the resistances, excluding quantization.
-        rounding_ohm: (U, K) standard deviation of the quantization error, ohm; 0 if unknown.
+        rounding_ohm: (U, K) standard deviation of the quantization error, in ohms; 0 if unknown.
         quadratic: (U K,) work array.
         cubic: (U K,) work array.
 
@@ -242,10 +242,10 @@ class NoiseEstimate:
         """Process the next frame; return whether :attr:`factor` changed.
 
         Args:
-            ohm: (U, K) resistances, ohm.
+            ohm: (U, K) resistances, in ohms.
             noise: (U, K) stated relative standard deviation of the resistances; excludes quantization if
                 ``rounding_ohm`` is given.
-            rounding_ohm: (U, K) standard deviation of the quantization error, ohm; default: 0.
+            rounding_ohm: (U, K) standard deviation of the quantization error, in ohms; default: 0.
             valid: (U, K) bool, False for missing readings; default: all True.
         """
         if self._pause:

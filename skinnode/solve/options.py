@@ -29,7 +29,7 @@ class EstimateOptions:
 
     Args:
         relative_noise: Relative standard deviation of R, scalar or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors in resistivity and gain
+        baseline_ohm: (U, K) resistances measured at rest, in ohms. If given, errors in resistivity and gain
             cancel.
         rubber: Material of the skin. Forces are proportional to its modulus; displacements do not depend on
             the modulus.
@@ -55,9 +55,9 @@ class EstimateOptions:
             unknowns.
         hold: Whether to keep the last solution of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit for an update, µs; an update can exceed it by the duration of one solver step.
-            Wires that are unsolved at the deadline have the status DEADLINE.
-        prior: Prior of the loads after the posterior has found a touch: ``cells`` for one variance per cell,
+        deadline_us: Time limit for an update, in µs; an update can exceed it by the duration of one solver
+            step. Wires that are unsolved at the deadline have the status DEADLINE.
+        prior: Prior for the loads after the posterior has found a touch: ``cells`` for one variance per cell,
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
             the loads are not local, ``discs`` falls back to ``cells``.
@@ -109,7 +109,7 @@ class EstimateOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: ``scale_m`` and those of :class:`EstimateOptions`.
+    """Options of :class:`skinnode.Posterior`: ``scale_m`` and the options of :class:`EstimateOptions`.
 
     Args:
         scale_m: RMS normal displacement in the prior, in metres; by default, it is estimated from the data.
@@ -135,7 +135,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: the following and those of :class:`EstimateOptions`.
+    """Options of :class:`skinnode.Tracker`: the options below and all options of :class:`EstimateOptions`.
 
     Only the posterior supports ``drift``, ``model_error``, ``tolerances`` and ``estimate_noise``. If any of
     them is set, ``auto`` selects the posterior.
@@ -143,20 +143,20 @@ class TrackerOptions(EstimateOptions):
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, N/m. If given, the exact inverse
+        stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, in N/m. If given, the exact inverse
             computes ``force_n`` by this law. All other forces, including contact forces, are computed from
             ``rubber``.
         active_only: Whether to fix electrodes at rest unless a contact moves them; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
-        max_std_m: Maximum standard deviation of a coordinate in a precise field, metres. The default depends
-            on the layout and the noise (:mod:`skinnode.solve.precision`).
+        max_std_m: Maximum standard deviation of a coordinate in a precise field, in metres. The default
+            depends on the layout and the noise (:mod:`skinnode.solve.precision`).
         max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, in N. The
             default depends on the layout and the rubber, and applies only to calibrated forces.
         detect: Whether to detect touches before solving (:mod:`skinnode.solve.detect`). An untouched patch is
             then not solved, unless ``hold`` is off or ``estimate_noise`` is on.
-        false_alarms_per_hour: Accepted number of touches per hour that are reported because of noise alone.
-        scan_period_s: Time between successive frames, s. The detector uses this time to model gain drift and
-            to limit the number of false alarms.
+        false_alarms_per_hour: Accepted number of touches per hour reported because of noise alone.
+        scan_period_s: Time between successive frames, in s. The detector uses this time to model gain drift
+            and to limit the number of false alarms.
 
     Raises:
         ValueError: If an option is out of range.
@@ -190,7 +190,7 @@ class TrackerOptions(EstimateOptions):
 
     @property
     def nuisances(self) -> list[str]:
-        """Names of the options that are set and that only the posterior supports."""
+        """Names of all set options that only the posterior supports."""
         asked = {
             "drift": self.drift != "none",
             "model_error": self.model_error > 0,

@@ -25,8 +25,8 @@ from skinnode.solve.wires.problem import PatchProblem
 MULTIPLE: Final = 15.0
 """Default limit on a standard deviation, as a multiple of the exact inverse's RMS standard deviation at rest.
 
-In 2,640 simulated fields of healthy patches (ten layouts, relative noise 3e-6 to 1e-3, presses of 5 to 30 %),
-the largest ratio was 12.2.
+In 2,640 simulated fields of healthy patches (ten layouts, relative noise 3e-6 to 1e-3, presses of 5 to 30 %
+of h), the largest ratio was 12.2.
 """
 MOST: Final = 0.3
 """Upper bound on the default limit, in clearances; larger standard deviations mean that the prior dominates
@@ -45,8 +45,8 @@ to 0.028 clearances.
 FORCE_SHARE: Final = 0.3
 """Default limit on a normal force's standard deviation, in units of modulus · clearance · pitch.
 
-In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1. It reached 0.26 in presses of 50 %
-that were half outside the patch.
+In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1. It reached 0.26 in presses of 50 % of
+h that were half outside the patch.
 """
 
 

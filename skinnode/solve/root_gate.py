@@ -28,7 +28,7 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after a solve that missed its deadline.
+"""Number of frames until the next posterior solve, after a posterior solve that missed its deadline.
 
 Without this pause, a posterior that misses every deadline would delay the other patches on the same thread by
 2 ms per frame.
@@ -164,7 +164,7 @@ class RootGate:
         return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
-        """Enlarge the standard deviations of held wires as in the frame that confirmed their roots.
+        """Enlarge the standard deviations of held wires by the terms found when their roots were confirmed.
 
         Args:
             field: Field to amend.
@@ -258,7 +258,7 @@ class RootGate:
 
 
 def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
-    """Return the data share: that of ``estimate`` for the ``replaced`` wires (U,), 1 for all others."""
+    """Return the data share: the value in ``estimate`` for the ``replaced`` wires (U,), 1 for all others."""
     if estimate.data_share is None or not replaced.any():
         return None
     return np.where(replaced[:, None, None], estimate.data_share, 1.0)

@@ -1,9 +1,9 @@
 """Criteria for choosing among the roots of F = b, and their thresholds.
 
-The equations F = b of a wire have several roots, but the skin is at only one of them. The roots on either
-side of a fold (a surface where det J = 0) are called twins; they merge at the fold. Five criteria identify
-the correct root: the sign of det J, the distance from the rest position, the roughness, the energy compared
-with other roots of the wire, and the posterior estimate of the whole patch.
+The equations F = b of a wire have several roots, but only one of them is the actual position of the skin. The
+roots on either side of a fold (a surface where det J = 0) are called twins; they merge at the fold. Five
+criteria identify the correct root: the sign of det J, the distance from the rest position, the roughness, the
+energy compared with other roots of the wire, and the posterior estimate of the whole patch.
 
 Definitions:
 

@@ -1,6 +1,6 @@
 """Tracker that estimates the displacement field of a patch for each frame of a live stream.
 
-The method ``exact`` solves each upper wire separately. The method ``posterior`` estimates the whole patch at
+The ``exact`` method solves each upper wire separately. The ``posterior`` method estimates the whole patch at
 once, using an elastic prior. The default method, ``auto``, selects ``exact`` if the noise is low enough, and
 ``posterior`` otherwise. The posterior also checks doubtful roots found by the exact method
 (:mod:`skinnode.solve.root_gate`).
@@ -13,7 +13,7 @@ The tracker estimates the noise of the stream and corrects the stated noise
 crosses the limit for ``exact``. The new method starts at the rest position.
 
 On request, the posterior also uses the readings of earlier frames (:mod:`skinnode.solve.posterior.past`), but
-none from before an untouched frame or a gap in the stream.
+no readings from before an untouched frame or a gap in the stream.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Invalid code, never sent by a converter, that replaces the code of a reading to be ignored."""
+"""Invalid code that replaces the code of a reading to be ignored; converters never send it."""
 EXACT_STD: Final = 0.0025
 """RMS standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` selects ``exact``.
 
@@ -51,7 +51,7 @@ With 16-bit codes, the standard deviation is 0.0005 on the staggered layout with
 aligned layout.
 """
 GAP_NS: Final = 2_000_000_000
-"""Interval between two frames, ns, above which frames before the gap are not used."""
+"""Interval between two frames, in ns, above which frames before the gap are not used."""
 
 
 class Tracker:
@@ -165,7 +165,7 @@ class Tracker:
             frame_ohm: (U, K) resistances, in ohms; values that are not positive and finite are ignored.
             valid: (U, K) bool: False for missing readings; default: all True.
             relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
-                default: the option ``relative_noise``. A resistance is ignored if its standard deviation is
+                default: the ``relative_noise`` option. A resistance is ignored if its standard deviation is
                 not positive and finite.
 
         Returns:
@@ -197,20 +197,20 @@ class Tracker:
         This method is faster than decoding the codes and calling :meth:`update`.
 
         Args:
-            codes: (U, K) uint32 codes; the option ``codes`` maps them to resistances.
+            codes: (U, K) uint32 codes; the ``codes`` option maps them to resistances.
 
         Returns:
             The field, and the number of invalid codes.
 
         Raises:
-            ValueError: If ``codes`` has the wrong shape or type, or the option ``codes`` is not set.
+            ValueError: If ``codes`` has the wrong shape or type, or the ``codes`` option is not set.
         """
         start, meaning = perf_counter(), self.options.codes
         if meaning is None:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
         self._note_gap()
         if self._rest is not None:
-            assert self._decoder is not None  # the option ``codes`` is set
+            assert self._decoder is not None  # the ``codes`` option is set
             ohm, _, invalid = self._decoder.decode(checked_codes(codes, self.layout))
             rest = self._at_rest(ohm, None, None, meaning)  # invalid codes are NaN
             if rest is not None:

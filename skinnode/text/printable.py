@@ -30,7 +30,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
     """Return ``text`` as one line, with non-printable characters escaped.
 
     Args:
-        text: The text, or the bytes of a VISIBLE_STRING: one character per byte; trailing NULs are removed.
+        text: Text, or the bytes of a VISIBLE_STRING, one per character; trailing NULs are removed.
         most: Maximum number of characters; longer text is truncated and ends in ``…``.
     """
     if isinstance(text, bytes):
@@ -56,7 +56,7 @@ def _escaped(found: re.Match[str]) -> str:
 class PrintableStream:
     """Wrapper around a text stream, such as stdout, that escapes non-printable characters.
 
-    Rich bypasses the wrapper: it writes to the stream in the attribute ``rich_proxied_file``.
+    Rich bypasses the wrapper: it writes to the stream in the ``rich_proxied_file`` attribute.
     """
 
     def __init__(self, stream: TextIO) -> None:

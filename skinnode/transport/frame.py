@@ -1,4 +1,4 @@
-"""Received CAN frame, in the same form on every type of interface."""
+"""Received CAN frame, in the same format for all types of interfaces."""
 
 from __future__ import annotations
 

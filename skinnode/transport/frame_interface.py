@@ -12,7 +12,7 @@ from skinnode.transport.frame import Frame
 class FrameInterface(Protocol):
     """Interface with direct frame methods, which :class:`~skinnode.transport.CanPort` uses if present.
 
-    On a simulated bus, converting frames to ``can.Message`` and back would take longer than everything else.
+    On a simulated bus, converting frames to ``can.Message`` and back would take longer than all other work.
     A python-can interface may provide these methods; for udp_multicast,
     :class:`~skinnode.transport.multicast.MulticastSocket` does.
     """
@@ -46,7 +46,7 @@ class SignallingInterface(FrameInterface, Protocol):
     """
 
     def call_on_arrival(self, function: Callable[[], object]) -> None:
-        """Call ``function``, which must not wait, whenever frames have arrived.
+        """Call ``function``, which must not block, whenever frames have arrived.
 
         A frame that arrives before the time given to :meth:`hold_until` is announced at that time.
         """

@@ -23,14 +23,14 @@ from skinnode.errors import ConfigError
 from skinnode.transport.frame import Frame
 
 SUFFIXES: Final = (".log", ".blf")
-"""Suffixes of logs that can be recorded: if the process is killed, the file is readable up to the last
-flush."""
+"""Suffixes of log formats suitable for recording: if the process is killed, the file is readable up to the
+last flush."""
 WRITABLE: Final = (*SUFFIXES, ".asc")
 """Suffixes of logs that can be written."""
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Maximum size of a BLF container before compression, in bytes. Less is written between two flushes, so no
-frame is split between containers."""
+"""Maximum size of a BLF container before compression, in bytes. The data written between two flushes is
+smaller, so no frame is split between containers."""
 
 
 class LoggedFrame(NamedTuple):
@@ -69,7 +69,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame. Until the next :meth:`flush`, a crash can lose it."""
+        """Write a frame. If the process is killed before the next :meth:`flush`, the frame may be lost."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open(frame.t_ns)
@@ -91,7 +91,7 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass all frames to the operating system, so that they are not lost if the process ends.
+        """Pass all frames to the operating system, so that they survive if the process is killed.
 
         Args:
             to_disk: Whether to wait until the frames are on the disk, so that they survive a power failure.
@@ -129,7 +129,7 @@ class FrameLog:
         try:
             writer.stop()
         finally:
-            with contextlib.suppress(OSError):  # a full disk raises the same error again
+            with contextlib.suppress(OSError):  # if the disk is full, close() fails again
                 writer.file.close()
 
 

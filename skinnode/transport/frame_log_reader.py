@@ -148,7 +148,9 @@ class FrameLogReader:
                     tail = b""
                 at = following
             if tail:
-                self._complain(None, size, f"truncated: a frame that ends after {counted(len(tail), 'byte')}")
+                self._complain(
+                    None, size, f"truncated: the last frame ends after {counted(len(tail), 'byte')}"
+                )
 
     def _container(self, data: mmap.mmap, at: int) -> _Container:
         """Return the BLF container at file offset ``at``.

@@ -2,8 +2,8 @@
 
 python-can opens and configures the socket, and defines the packet format: a msgpack map with one entry per
 attribute of ``can.Message``. Converting every frame to ``can.Message`` and msgpack would take longer than
-sending it. However, everything except the timestamp and the data recurs in a program's packets, so python-can
-converts each kind of frame only once:
+sending it. However, packets of the same kind differ only in their timestamps and data, so python-can converts
+each kind only once:
 
 - When a frame is sent, its data is inserted into a packet that python-can has packed for this identifier and
   length.
@@ -100,7 +100,7 @@ class MulticastSocket:
     """Endpoint in a multicast group. Any thread may send, but only one thread may receive.
 
     Args:
-        bus: Open python-can bus. The endpoint takes over its socket and shuts the bus down.
+        bus: Open python-can bus. The endpoint duplicates the bus's socket and shuts down the bus.
         group: Address of the multicast group.
         tag: Result of :func:`new_tag`.
     """
@@ -261,7 +261,8 @@ def limit_to_group(sock: socket.socket) -> None:
     """Limit a multicast socket to the groups it has joined, and discard the packets received so far.
 
     python-can binds the socket to all addresses. Such a socket receives the packets of every multicast group
-    that any program on this machine has joined, unless this is disabled.
+    that any program on this machine has joined, unless the socket option IP_MULTICAST_ALL or
+    IPV6_MULTICAST_ALL is 0.
     """
     if sock.family == socket.AF_INET:
         sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)

@@ -1,7 +1,7 @@
 """CAN bus endpoint with the same behaviour on every type of interface.
 
 python-can errors are converted to :class:`~skinnode.errors.BusError` with a one-line message. Arrival times
-are on the host's monotonic clock. The interfaces virtual, udp_multicast and socketcan provide wall-clock
+are on the host's monotonic clock. The virtual, udp_multicast and socketcan interfaces provide wall-clock
 timestamps, which are converted.
 """
 
@@ -297,7 +297,7 @@ class CanPort(Closing):
         Args:
             timeout_s: Maximum time to wait for a frame, in s.
             most: Maximum number of frames. Interfaces other than socketcan, udp_multicast and timed return
-                one at a time.
+                one frame at a time.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -331,7 +331,7 @@ class CanPort(Closing):
         return [_frame(message)]
 
     def reopen(self) -> None:
-        """Close and reopen the interface after a failure. The counters keep their values.
+        """Close and reopen the interface after a failure. The counters are not reset.
 
         The receiving thread must have ended. While the interface is closed, :meth:`send` raises BusError.
 
@@ -351,7 +351,7 @@ class CanPort(Closing):
         """Change the bit rate and reopen the interface.
 
         The receiving thread must have ended. On socketcan, the bit rate is set with ``ip link``, which
-        requires the capability CAP_NET_ADMIN.
+        requires the CAP_NET_ADMIN capability.
 
         Raises:
             BusError: if the interface rejects the bit rate. The interface is then open at the previous bit

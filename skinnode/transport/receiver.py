@@ -82,7 +82,7 @@ class Intake:
         self._put = self._taken = self._dropped = 0
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
-        self._first_ns = 0  # earliest predicted arrival; 0 if a group without a prediction exists
+        self._first_ns = 0  # earliest predicted arrival; 0 if any group has no prediction
         self._asked_ns = 0
 
     @property
@@ -214,7 +214,7 @@ class Receiver(Closing):
 
     Args:
         intakes: Queues to fill, one per port.
-        on_defect: Callback for an exception that does not come from a port. Reception continues afterwards.
+        on_defect: Callback for an exception that is not raised by a port. Reception then continues.
     """
 
     def __init__(
@@ -301,7 +301,7 @@ class Receiver(Closing):
                 self._on_defect(error)
 
     def _gather_signalled(self, intake: Intake, now_ns: int) -> None:
-        """Fetch the remaining frames, and have the port announce no more until the next fetch is due."""
+        """Fetch the remaining frames, and defer the port's announcements until the next fetch is due."""
         while not intake.failed and intake.fetch(0.0):
             pass
         intake.gather(now_ns)

@@ -1,7 +1,7 @@
 """Receives many socket messages with one call to recvmmsg(2), which Python's socket module lacks.
 
-The call does not wait and takes about 1 µs per message, so it keeps the global interpreter lock (GIL).
-Releasing the GIL for each message would delay other threads longer than that.
+The call does not block and takes about 1 µs per message, so it keeps the global interpreter lock (GIL).
+Releasing the GIL for each message would delay other threads for longer.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class MessageBatch:
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
-        """Return the memory of the received messages.
+        """Return a view of the memory that contains the received messages.
 
         Each message occupies a record of fixed length: its data, padded to ``size`` bytes, and its ancillary
         data, padded to ``control`` bytes.

@@ -102,7 +102,7 @@ class SocketReader:
         earliest_ns, latest_ns = now_ns - OLDEST_NS, now_ns + _NEWEST_NS
         second = second_ns = 0
         frames: list[Frame] = []
-        new = tuple.__new__  # half the time of Frame.__new__
+        new = tuple.__new__  # takes half as long as Frame.__new__
         for (control, length), record in zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True):
             word, size, data, seconds, nanoseconds, hardware_s = record
             if control == _STAMPED_BYTES and not hardware_s:

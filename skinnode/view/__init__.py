@@ -9,6 +9,6 @@ Data flows in one direction::
 ``picture`` computes a field's picture, using shapes from ``geometry`` and colours from ``colours``;
 ``placement`` places the patches. ``texts`` writes Markdown tables. ``drawing`` writes pictures and tables to
 a recording ``stream``; ``blueprint`` defines the window layout. ``outputs`` opens windows, pages and files:
-``viewer_process`` runs the viewer as a child process, and ``web_page`` serves it to a browser without access
-to other computers. Only ``drawing``, ``blueprint`` and ``stream`` require the package rerun-sdk.
+``viewer_process`` runs the viewer as a child process, and ``web_page`` serves it to a browser without
+contacting other computers. Only ``drawing``, ``blueprint`` and ``stream`` require the rerun-sdk package.
 """

@@ -76,7 +76,7 @@ class Conversion:
         """Draw all of the recording's fields, and the hand's state.
 
         Args:
-            draw: Function that draws the data of one instant.
+            draw: Function that draws the data for one instant.
         """
         self._draw = draw
         for field in self.replay:

@@ -141,7 +141,7 @@ class HandDrawing:
             log(path, rr.SeriesLines(names=lines, colors=shades, widths=widths), static=True)
 
     def draw(self, tick: Tick) -> None:
-        """Write the new data of one instant.
+        """Write the new data for one instant.
 
         Args:
             tick: New fields and, at some instants, the hand's state.

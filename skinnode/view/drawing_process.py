@@ -106,7 +106,7 @@ def _run(hand: HandConfig, target: Target, options: DrawingOptions, parent: Conn
     from skinnode.view.drawing import HandDrawing
     from skinnode.view.stream import open_stream
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent, which also receives it, closes the pipe
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent also receives SIGTERM and closes the pipe
     os.nice(_NICE)
     try:
         with open_stream(target) as stream:

@@ -1,4 +1,4 @@
-"""Computes a field's picture as arrays: surface, arrows and contacts. The viewer is not required."""
+"""Computes a field's picture as arrays: surface, arrows and contacts. Does not require the viewer."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Style:
 class PatchPicture:
     """Picture of one field, in patch coordinates; all lengths are in metres.
 
-    C is the number of contacts and S the number of shear arrows. The points are those of the (U, N) grid, in
-    row-major order.
+    C is the number of contacts and S the number of shear arrows. The points form the (U, N) grid and are
+    stored in row-major order.
     """
 
     points_m: Float

@@ -19,7 +19,7 @@ from skinnode.model.pose import Pose
 ROOT: Final = "skin"
 """Parent entity of the links and patches; its coordinate frame is the hand's."""
 _GAP: Final = 1.4
-"""Centre-to-centre distance of patches drawn side by side, in widths of the largest patch."""
+"""Centre-to-centre distance of patches drawn side by side, as a multiple of the largest patch's width."""
 _SAME_M: Final = 1e-6
 """Maximum distance at which two patches count as being in the same place, in m."""
 

@@ -13,7 +13,7 @@ from skinnode.view.outputs import Target
 _APPLICATION: Final = "skinnode"
 _FLUSH_S: Final = 5.0
 _BATCH_MS: Final = 20
-"""Maximum time for which the SDK holds data back, in ms; shorter than the interval between two pictures."""
+"""Maximum time for which the SDK buffers data, in ms; shorter than the interval between two pictures."""
 
 
 @contextmanager
@@ -38,6 +38,6 @@ def open_stream(target: Target) -> Iterator[rr.RecordingStream]:
     try:
         yield stream
     finally:
-        with suppress(RuntimeError):  # the viewer has gone or stopped reading; a file is complete up to here
+        with suppress(RuntimeError):  # the viewer has exited or stopped reading; a file is complete so far
             stream.flush(timeout_sec=_FLUSH_S)
         stream.disconnect()

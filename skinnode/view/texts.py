@@ -39,7 +39,7 @@ def contacts_text(frame: HandFrame) -> str:
         return "No patch has a current field."
     wrenches = [*frame.wrenches.values(), frame.wrench]
     names = [*frame.wrenches, "whole hand"]
-    one = len(frame.wrenches) == 1  # the wrench of a single link is the hand's in another coordinate frame
+    one = len(frame.wrenches) == 1  # a single link's wrench equals the hand's in another coordinate frame
     rows = list(zip(names, wrenches, strict=True))[1 if one else 0 :]
     head = ("contact on", "normal force", "shear force", "position in the hand", "area")
     contacts = _table(head, [_contact_row(contact) for contact in frame.contacts])
@@ -69,7 +69,7 @@ def _wrench_row(name: str, wrench: Wrench) -> tuple[str, ...]:
 
 
 def health_text(view: View, counts: DrawnCounts, notes: Iterable[str] = ()) -> str:
-    """Return the text that describes the state of all patches and buses, and gives the field counts.
+    """Return the text that describes the state of all patches and buses, including the field counts.
 
     Args:
         view: State of the hand.

@@ -1,4 +1,4 @@
-"""Runs the ``rerun`` program from the package rerun-sdk as a child process: a window or a server.
+"""Runs the ``rerun`` program from the rerun-sdk package as a child process: a window or a server.
 
 The program sends usage statistics unless its configuration file disables them. The child process therefore
 gets a separate configuration folder with a file that disables them. The user's settings are neither read nor
@@ -27,7 +27,7 @@ from skinnode.process.closing import Closing
 
 LOCAL: Final = "127.0.0.1"
 MEMORY: Final = "512MB"
-"""Memory limit for data kept for browsers. Beyond this limit, the oldest data are dropped."""
+"""Memory limit for data buffered for browsers. Beyond this limit, the oldest data are dropped."""
 _STYLES: Final = re.compile(r"\x1b\[[0-9;]*m")
 _READY_S: Final = 30.0
 _END_S: Final = 5.0
@@ -77,11 +77,11 @@ class ViewerProcess(Closing):
 
     @property
     def closed(self) -> bool:
-        """Whether the process has exited without an error because its window was closed."""
+        """Whether the process has exited normally because its window was closed."""
         return self._process.poll() == 0
 
     def why(self) -> str:
-        """Return the last line that the process wrote to stderr or, if none, the signal that ended it."""
+        """Return the last line of the process's stderr or, if it is empty, the signal that ended it."""
         lines = _STYLES.sub("", self._errors.read_text("utf-8", "replace")).splitlines()
         status = self._process.poll()
         silent = "no message" if status is None or status >= 0 else signal.strsignal(-status)
@@ -112,7 +112,7 @@ class ViewerProcess(Closing):
 
 
 def require_viewer(key: str = "skinnode view") -> None:
-    """Raise ConfigError if the package rerun-sdk is not installed.
+    """Raise ConfigError if the rerun-sdk package is not installed.
 
     Args:
         key: Command or argument that requires the package, for the error message.

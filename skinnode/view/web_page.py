@@ -1,4 +1,4 @@
-"""Serves the rerun-sdk viewer to a browser, without any access to other computers.
+"""Serves the rerun-sdk viewer to a browser, without contacting other computers.
 
 The SDK's page loads fonts from other computers, and its viewer sends usage statistics. This server removes
 the fonts from the page and adds a content security policy, so the browser blocks every connection except

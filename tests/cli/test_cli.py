@@ -136,7 +136,7 @@ def skinnode_version() -> str:
         ),
         (
             "host hand.toml --seconds -1",
-            "skinnode host: --seconds: got '-1', allowed: a number of seconds, at least 0",
+            "skinnode host: --seconds: got '-1', allowed: a non-negative number of seconds",
         ),
         ("node --source simulated --seconds inf", "skinnode node: --seconds: got 'inf', allowed: a number"),
         ("record hand.toml x --seconds nan", "skinnode record: --seconds: got 'nan', allowed: a number"),

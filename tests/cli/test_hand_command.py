@@ -239,7 +239,8 @@ def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
     thick = 'layout = { preset = "aligned", height_m = 4e-3 }\n'
     solver = '[solver]\nmethod = "exact"\n'
     assert "too large to be" in said(notes(tmp_path, solver + PALM + thick + EXACT), "solver.method")["palm"]
-    assert "cannot include the tolerances" in said(notes(tmp_path, solver + PALM), "solver.method")["palm"]
+    said_of_method = said(notes(tmp_path, solver + PALM), "solver.method")
+    assert "cannot account for the patch's tolerances" in said_of_method["palm"]
     assert not said(notes(tmp_path, solver + PALM + EXACT), "solver.method")
     assert not said(notes(tmp_path, PALM), "solver.method")
 

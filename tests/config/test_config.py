@@ -201,7 +201,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["patches", 0, "tolerances"],
             {"placement": 0.5},
-            "patches[0].tolerances.placement: got 0.5, allowed: a number of at least 0 and below 0.5",
+            "patches[0].tolerances.placement: got 0.5, allowed: a non-negative number below 0.5",
         ),
         (
             ["patches", 0, "tolerances"],
@@ -221,7 +221,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["sync", "stagger_ms"],
             -1,
-            "sync.stagger_ms: got -1, allowed: a delay of at least 0 ms",
+            "sync.stagger_ms: got -1, allowed: a non-negative delay",
         ),
         (
             ["sync", "counter_overflow"],
@@ -273,12 +273,12 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["patches", 0, "pose", "position_m"],
             [0.0, 1.0],
-            "patches[0].pose.position_m[2]: got nothing, allowed: three numbers [x, y, z], metres",
+            "patches[0].pose.position_m[2]: got nothing, allowed: three numbers [x, y, z] in metres",
         ),
         (
             ["patches", 0, "pose", "position_m"],
             [0.0, 1.0, "2"],
-            "patches[0].pose.position_m[2]: got '2', allowed: three numbers [x, y, z], metres",
+            "patches[0].pose.position_m[2]: got '2', allowed: three numbers [x, y, z] in metres",
         ),
         (
             ["patches", 0, "pose", "quaternion_xyzw"],
@@ -301,7 +301,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["links"],
             [{"name": "palm", "pose": {"position_m": [0.0, 0.0]}}],
-            "links[0].pose.position_m[2]: got nothing, allowed: three numbers [x, y, z], metres",
+            "links[0].pose.position_m[2]: got nothing, allowed: three numbers [x, y, z] in metres",
         ),
         (
             ["patches", 0, "calibration", "upper_gain"],
@@ -316,7 +316,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["simulation", "depth"],
             1.0,
-            "simulation.depth: got 1.0, allowed: a number of at least 0 and below 1",
+            "simulation.depth: got 1.0, allowed: a non-negative number below 1",
         ),
     ],
 )

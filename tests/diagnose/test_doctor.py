@@ -181,7 +181,7 @@ def test_another_layout_serial_and_eds(hand_file: HandFile, on: On, tmp_path: Pa
 def test_a_node_that_is_gone_and_a_bus_without_any(hand_file: HandFile, on: On) -> None:
     file = hand_file()
     hand = load_hand(file)
-    assert examine(file)[1].keys() == {"can0: no node of the hand answers"}
+    assert examine(file)[1].keys() == {"can0: none of the hand's nodes answers"}
     on(Fleet(hand.model_copy(update={"patches": hand.patches[1:]})))
     assert examine(file)[1].keys() == {"thumb: the node is missing"}
 

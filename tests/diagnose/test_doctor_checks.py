@@ -127,7 +127,7 @@ def test_a_node_that_is_missing_is_told_from_a_bus_that_is_silent() -> None:
     other = PatchFacts("index", 6, found=node(6))
     gone = PatchFacts("thumb", 5)
     assert one(bus_of(gone, other)).what == "the node is missing"
-    assert one(bus_of(gone, PatchFacts("index", 6))).what == "no node of the hand answers"
+    assert one(bus_of(gone, PatchFacts("index", 6))).what == "none of the hand's nodes answers"
 
 
 def skin(ratio: np.ndarray, **changes: Any) -> Finding:

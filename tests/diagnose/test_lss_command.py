@@ -76,7 +76,7 @@ def test_what_is_refused(bus: BusConfig, powered: Powered) -> None:
     for arguments, line in (
         (["--serial", "7", "--node-id", "5"], "--node-id: got 5, allowed: a node-ID that no other node has"),
         (["--serial", "8", "--node-id", "6"], "--serial: got 8, allowed: the serial number of a node"),
-        (["--node-id", "6"], "because no node without a node-ID was found"),
+        (["--node-id", "6"], "because the search for nodes without a node-ID found none"),
         (["--serial", "7"], "--node-id, --bit-rate"),
         (["--serial", "7", "--bit-rate", "123"], "--bit-rate: got 123, allowed: 1000000, 800000"),
         (["--serial", "7", "--bit-rate", "500000"], "bit rate 500000: got error code 1"),

@@ -205,7 +205,7 @@ def test_a_failure_of_the_host_ends_callbacks_with_a_warning(
     publisher.fail(BusError("gone"))
     assert eventually(lambda: callback.ended)
     warnings = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.WARNING]
-    assert [text.endswith("is not called any more: gone") for text in warnings] == [True]
+    assert [text.endswith("is no longer called: gone") for text in warnings] == [True]
 
 
 @pytest.mark.parametrize("boot_deadline_s", [float("nan"), float("inf"), -1.0])

@@ -63,7 +63,7 @@ def test_packages_of_two_hands_fit_into_one_workspace_and_nothing_is_overwritten
         (tmp_path / f"{name}.toml").write_text(f'name = "{name}"\n{HAND}', encoding="utf-8")
         done = run_here("hand", "ros2", str(tmp_path / f"{name}.toml"), "-o", str(tmp_path))
         assert (done.returncode, done.stderr) == (0, "")
-        assert 'note: can0: the host must be a guest beside ros2_canopen (role = "guest")' in done.stdout
+        assert 'note: can0: the host must be a guest alongside ros2_canopen (role = "guest")' in done.stdout
     found = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*.*") if file.is_file()}
     assert {"left_canopen/config/can0/bus.yml", "right_canopen/launch/can0.launch.py", *FILES} <= found
     changed = tmp_path / "left_canopen" / "config" / "can0" / "bus.yml"

@@ -406,7 +406,7 @@ def test_a_missing_extra_is_one_line_with_what_to_install(
         Recorder(a_hand(), tmp_path / "x.mcap")
     assert str(refused.value) == (
         f"{tmp_path / 'x.mcap'}: got no package rosbags, "
-        "allowed: the packages of the extra mcap (install: sh install.sh mcap)"
+        "allowed: the packages of the mcap extra (install: sh install.sh mcap)"
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -139,7 +139,7 @@ def test_a_missing_extra_is_one_line(
     status, text = said([str(hand_file), "--publish"], capsys)
     assert status == 2
     assert text == (
-        "error: --publish: got no package eclipse-zenoh, allowed: the packages of the extra zenoh "
+        "error: --publish: got no package eclipse-zenoh, allowed: the packages of the zenoh extra "
         "(install: sh install.sh zenoh)\n"
     )
     with pytest.raises(ConfigError, match="connect: got no package eclipse-zenoh"):

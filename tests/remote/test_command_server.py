@@ -102,7 +102,7 @@ def test_the_end_of_the_daemon_waits_for_no_command(session: zenoh.Session) -> N
     programs.join()
     assert host.tared == ["a"]
     assert programs.failures["a"].endswith("cancelled")
-    assert "tare of 'b' not executed: the daemon is ending" in programs.failures["b"]
+    assert "tare of 'b' not executed: the daemon is shutting down" in programs.failures["b"]
     server.close()
 
 

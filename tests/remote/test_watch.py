@@ -291,7 +291,7 @@ def test_a_missing_extra_is_one_line(port: int, monkeypatch: pytest.MonkeyPatch)
     status, lines, said = refused(port)
     assert (status, lines) == (2, [])
     assert said == (
-        "error: --remote: got no package eclipse-zenoh, allowed: the packages of the extra zenoh "
+        "error: --remote: got no package eclipse-zenoh, allowed: the packages of the zenoh extra "
         "(install: sh install.sh zenoh)\n"
     )
 

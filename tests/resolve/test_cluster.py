@@ -158,4 +158,4 @@ def test_the_missing_package_is_named(
     done = CliRunner().invoke(
         app, ["resolve", str(recording), "-o", str(tmp_path / "out"), "--scheduler", "x"]
     )
-    assert str(done.exception).endswith("the package of the extra cluster (install: sh install.sh cluster)")
+    assert str(done.exception).endswith("the package of the cluster extra (install: sh install.sh cluster)")

@@ -84,7 +84,10 @@ def test_ends_cleanly_when_told(hand: Path, number: signal.Signals) -> None:
         (HAND + "code_bit = 16", ["hand.toml", "patches[1].code_bit", "did you mean code_bits"]),
         (HAND.replace('name = "can0"', 'name = "can0'), ["hand.toml", "line 3"]),
         (HAND.replace("virtual", "no-such-thing"), ["no-such-thing"]),
-        (HAND + "\n[simulation]\ndepth = 1.5\n", ["simulation.depth", "1.5", "at least 0 and below 1"]),
+        (
+            HAND + "\n[simulation]\ndepth = 1.5\n",
+            ["simulation.depth", "1.5", "non-negative number below 1"],
+        ),
     ],
 )
 def test_a_bad_hand_is_one_line_and_status_2(

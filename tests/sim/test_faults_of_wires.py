@@ -86,7 +86,7 @@ def test_of_one_patch_or_of_all() -> None:
             "a:stuck_lower=3",
             "stuck_lower: got 3, allowed: both stuck_upper and stuck_lower, which name a crossing",
         ),
-        ("a:open_upper=-1", "open_upper: got -1, allowed: an integer of at least 0"),
+        ("a:open_upper=-1", "open_upper: got -1, allowed: a non-negative integer"),
         ("a:open_upper=x", "--fault open_upper: got 'x', allowed: an integer, or none"),
     ],
 )

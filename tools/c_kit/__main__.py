@@ -1,7 +1,7 @@
-"""Measures the C99 kit: code size, memory, stack use, and the computing cost of one scan.
+"""Measures the C99 kit: code size, memory, stack use, and the cycles and instructions for one scan.
 
 ``python -m tools.c_kit`` prints a Markdown table. It requires ``gcc-arm-none-eabi`` and ``valgrind``,
-and the package ``unicorn`` from PyPI, which emulates a Cortex-M0+.
+and the PyPI package ``unicorn``, which emulates a Cortex-M0+.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ STEPS = tuple(step for steps in HALVES.values() for step in steps)
 
 
 def measure(profile: PatchProfile) -> dict[str, str]:
-    """Return the table column of a profile."""
+    """Return the column of the table for a profile, by row title."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in kit_files(profile).items():
@@ -60,7 +60,7 @@ def _run(*command: str) -> str:
 
 
 def _code(program: Path, half: str, inputs: tuple[str, ...]) -> str:
-    """Return the code size of one half of the kit, including C library and compiler functions."""
+    """Return the code size of the kit's board or master half, including C library and compiler functions."""
     roots = [f"measure_{step}" for step in HALVES[half]]
     keep = [f"-Wl,-u,{root}" for root in roots]
     _run(*ARM, "-Wl,--gc-sections", f"-Wl,-e,{roots[0]}", *keep, *inputs, "-o", str(program))

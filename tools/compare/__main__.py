@@ -5,7 +5,7 @@ streams of resistances for five layouts and two noise levels, with and without f
 these inputs. The results are the forward model, the fields of every tracker method and path operator, the
 replayed recordings, and generated files such as EDS files.
 
-The results are divided into parts. For each part, the report gives the hash of each commit's results, and the
+The results are divided into parts. For each part, the report lists the hash of each commit's results, and the
 largest relative difference in each array that differs.
 
 The exit status is 0 if float arrays agree to within ``--rtol``, by default exactly, and all other arrays are

@@ -24,7 +24,7 @@ NOISES = {"quiet": 1e-6, "noisy": 1e-3}
 
 
 def field_arrays(field: sk.FieldFrame) -> Arrays:
-    """Convert a field, except its time stamps, to named arrays."""
+    """Convert a field, except its timestamps, to named arrays."""
     found: Arrays = {
         "status": np.array([int(each) for each in field.status]),
         "counts": np.array([field.stats.evaluations, field.stats.jacobians, field.stats.steps]),

@@ -1,7 +1,7 @@
 """Compare the benchmark times of two commits: ``python -m tools.compare.speed OLD [NEW]``.
 
 NEW defaults to the working tree. Each round runs the benchmark once per commit. The commits take turns
-running first, so that changes in machine speed affect both equally. For each benchmark row, the report gives
+running first, so that changes in machine speed affect both equally. For each benchmark row, the report lists
 the shortest time of each commit and the ratio of these times. The times of NumPy and LAPACK do not depend on
 the commit, so their ratios show the machine's timing noise.
 

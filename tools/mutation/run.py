@@ -51,9 +51,10 @@ _KERNELS: Final = (
 _MEMORY_BYTES: Final = 8 << 30
 _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
-"""Time limit for a single test, s."""
+"""Time limit for a single test, in s."""
 _GRACE_S: Final = 60.0
-"""Fixed part of a stage's time limit, s. Six times its duration on unmutated code is added."""
+"""Fixed part of a stage's time limit, in s. The other part is six times the stage's duration on unmutated
+code."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 

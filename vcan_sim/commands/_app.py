@@ -35,7 +35,7 @@ class _Group(Group):
 app = App(
     name="vcan-sim",
     cls=_Group,
-    help="Simulate patches of robot skin as CANopen nodes. The default command is run.",
+    help="Simulate patches of robot skin as CANopen nodes. If no command is given, `run` is used.",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

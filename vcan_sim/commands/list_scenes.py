@@ -6,7 +6,7 @@ from __future__ import annotations
 def list_scenes() -> None:
     """List the scenes that come with the simulator, for use with `vcan-sim run --scene NAME`.
 
-    A scene can be played on a hand that has all patches named in the scene.
+    A scene can be played on any hand that has all patches named in the scene.
     """
     from vcan_sim.scenes.library import shipped_scenes
     from vcan_sim.scenes.tables import read_scene

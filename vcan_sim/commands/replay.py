@@ -30,7 +30,7 @@ def replay(
 ) -> None:
     """Send the frames of a recorded bus trace on a bus, with their original timing.
 
-    With --hand, the frames from each recorded bus are sent on the bus of the same name in the hand. Without
+    With --hand, the frames from each recorded bus are sent on the hand's bus of the same name. Without
     --hand, all frames are sent on the bus selected by --interface and --channel.
     """
     from contextlib import ExitStack

@@ -130,7 +130,7 @@ def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
 def _watch(
     fleet: Fleet, wait: Callable[[float], bool], seconds: float | None, poll: Callable[[], None]
 ) -> None:
-    """Print one status line per second until ``wait`` returns True, ``seconds`` pass or a thread fails."""
+    """Print one status line per second until ``wait`` returns True, ``seconds`` elapse or a thread fails."""
     start = clock.monotonic()
     before = fleet.report()
     silent_until_s = 0.0

@@ -77,7 +77,7 @@ class Grid:
     def largest_compliance(self) -> float:
         """Upper bound on the eigenvalues of the shear compliance matrix, m/Pa.
 
-        The bound is an estimate by power iteration plus a margin of 10 %. It also holds for every subset of
+        The bound is a power-iteration estimate plus a margin of 10 %. It also holds for every subset of
         the cells, because the compliance of a subset is a principal submatrix of this symmetric matrix.
         """
         vector = np.ones((2, *self.shape))

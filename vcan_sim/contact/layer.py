@@ -92,7 +92,7 @@ class Layer:
 
 
 class PointResponse:
-    """Surface displacement of a layer under a point force, minus that of a half-space.
+    """Surface displacement of a layer under a point force, minus the displacement of a half-space.
 
     The difference is a smooth function of the distance from the force, so it is tabulated.
 

@@ -65,7 +65,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
     Args:
         grid: Cells on the surface.
-        overlap_m: (X, Y) overlap of the body with the undeformed surface, metres; negative where there is a
+        overlap_m: (X, Y) overlap of the body with the undeformed surface, in m; negative where there is a
             gap.
         start_pa: (X, Y) initial guess for the pressure, Pa, such as the pressure at the previous time step.
         close: Largest permissible residual overlap or gap, relative to the maximum of ``overlap_m``.
@@ -109,7 +109,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y) in Pa: the overlap scaled by an exact line search."""
+    """Return a pressure (X, Y) in Pa: the overlap multiplied by a factor from an exact line search."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 

@@ -16,7 +16,7 @@ from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
 from vcan_sim.scenes.tables import FaultConfig, SceneConfig
 
 _WIRE: Final = re.compile(r"(?P<patch>.+) (?P<side>upper|lower) (?P<number>\d{1,4})")
-"""Form of a wire name in the key ``where``, such as ``palm upper 3``."""
+"""Format of a wire name in the ``where`` key, such as ``palm upper 3``."""
 
 
 def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:

@@ -23,7 +23,7 @@ def scene_file(scene: Path, option: str = "--scene") -> Path:
         option: Name of the option or argument in the error message.
 
     Raises:
-        ConfigError: ``scene`` has no suffix and is neither a file nor a shipped scene.
+        ConfigError: If ``scene`` has no suffix and is neither a file nor a shipped scene.
     """
     if scene.exists():
         return scene

@@ -92,7 +92,7 @@ class PatchScene:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield each touch in contact around ``t_s`` and its weighted time steps."""
+        """Yield each touch that is in contact around ``t_s``, and its weighted time steps."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)
@@ -106,7 +106,10 @@ class PatchScene:
 
 
 def _spline(share: float) -> tuple[float, float, float, float]:
-    """Return cubic B-spline weights of four time steps; ``share`` is the fraction from second to third."""
+    """Return the cubic B-spline weights of four time steps.
+
+    ``share`` is the elapsed fraction of the interval from the second to the third time step.
+    """
     s, rest = share, 1.0 - share
     cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
     second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)

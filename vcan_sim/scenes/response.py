@@ -15,8 +15,8 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Maximum range of the table of displacement versus distance, in layer thicknesses. Beyond it, the
-displacement is below ``FAR``."""
+"""Maximum range of the table of displacement versus distance, as a multiple of the layer thickness.
+Beyond it, the displacement is below ``FAR``."""
 CLUSTER_CELLS: Final = 6.0
 """Distance from the window, in cells, beyond which each block of 2 × 2 cells acts as one point force."""
 FAR: Final = 1e-5
@@ -115,7 +115,7 @@ class Electrodes:
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
     """Return a table of displacement versus distance from a point force, and its step in metres.
 
-    The half-space solution is that of Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections 3.2
+    The half-space solution is due to Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections 3.2
     and 3.6). :class:`vcan_sim.contact.layer.PointResponse` adds the correction for a layer.
     """
     r = np.linspace(0.0, reach_m, POINTS)

@@ -148,7 +148,7 @@ class MotionConfig(Table):
     to_s: _Time
     """Scene time at which the motion ends, in s."""
     by_m: _Place | None = None
-    """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its starting point."""
+    """Displacement [x, y] of the body, in m. For ``shear``, the body then returns to its starting point."""
     by_rad: _Angle | None = None
     """Angle of rotation for ``turn``, rad, counterclockwise as seen from above the skin."""
     depth_m: Length | None = None
@@ -159,7 +159,7 @@ class MotionConfig(Table):
     """Maximum distance of the body from the start of ``walk``, in metres."""
     every_s: _Duration | None = None
     """Time between consecutive random targets of ``walk``, in s; default: 0.5."""
-    seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] | None = None
+    seed: Annotated[int, Field(ge=0), Allowed("a non-negative integer")] | None = None
     """Random seed for ``walk``; default: 1."""
 
     @model_validator(mode="after")
@@ -242,7 +242,7 @@ class TouchConfig(Table):
         return self
 
     def _check_motions(self) -> None:
-        """Check that all motions lie within the touch and that ``press`` motions do not overlap."""
+        """Check that all motions take place during the touch and that ``press`` motions do not overlap."""
         pressed_s = 0.0
         for i, motion in enumerate(self.motions):
             key = f"motions[{i}]"

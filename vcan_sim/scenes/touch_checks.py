@@ -54,7 +54,7 @@ def window_of_touch(
 def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
     """Return the poses of the body during a touch and its repetitions, by time step number.
 
-    While the body is at rest, all time steps have the same pose, so a long touch costs little.
+    While the body is at rest, all time steps have the same pose, so a long touch is cheap to check.
     """
     path = {}
     for each in touch.each:

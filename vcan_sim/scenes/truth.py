@@ -19,7 +19,7 @@ class BodyContact:
         centre_m: (2,) centre of pressure in the patch frame, in metres.
         area_m2: Area of contact, m².
         depth_m: Depth of the body's lowest point below the undeformed surface, in metres.
-        force_n: (3,) force on the skin in the patch frame, N. The z component is negative because the force
+        force_n: (3,) force (N) on the skin in the patch frame. The z component is negative because the force
             points into the skin.
         origin_m: (2,) centre of the first cell, in metres.
         cell_m: Side length of a cell, in metres.

@@ -167,7 +167,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # the rest is within the error of the contact solver
+        if high - low < 0.1 * close * high:  # the remaining error is within the contact solver's
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:

@@ -1,10 +1,10 @@
 """Read-out of the crossbar: computes the measured resistances by nodal analysis of the complete network.
 
 A resistive wire is a chain of resistors that starts at the connector, with a node at each electrode. A wire
-without resistance is a single node. C is the matrix of conductances between upper and lower nodes. In series
-with each wire are its contact and a multiplexer (upper wires) or an amplifier input (lower wires). With the
-conductance matrices T of the chains and connectors, Kirchhoff's current law determines the voltages v of the
-upper nodes and w of the lower nodes (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
+without resistance is a single node. C is the matrix of conductances between upper and lower nodes. Each wire
+is in series with its contact and with a multiplexer (upper wires) or an amplifier input (lower wires). With
+the conductance matrices T of the chains and connectors, Kirchhoff's current law determines the voltages v of
+the upper nodes and w of the lower nodes (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
 
     ⎡ A_u   −C ⎤ ⎡ v ⎤   ⎡ currents fed ⎤
     ⎢          ⎥ ⎢   ⎥ = ⎢              ⎥,    A_u = diag(C 1) + T_u,    A_l = diag(Cᵀ 1) + T_l
@@ -31,7 +31,7 @@ class Side:
     Args:
         series_ohm: (W,) float64, ohm: total resistance of each wire's contact and its multiplexer or
             amplifier input, in series with the wire.
-        wire_ohm: Wire resistance per electrode pitch, ohm; 0 makes each wire a single node.
+        wire_ohm: Wire resistance per electrode pitch, in ohms; 0 makes each wire a single node.
         electrodes: Number of electrodes per wire.
     """
 
@@ -82,7 +82,7 @@ class Side:
 
 
 def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohms that the read-out ``grounded`` measures.
+    """Return the resistances (U, K) in ohms that the ``grounded`` read-out measures.
 
     Upper wires are driven one at a time, with all others grounded. A reading is the driving voltage divided
     by the current into the amplifier of a lower wire. Without series and wire resistances, a reading is the
@@ -108,7 +108,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohms that the read-out ``floating`` measures.
+    """Return the resistances (U, K) in ohms that the ``floating`` read-out measures.
 
     One pair of wires is measured while all other wires float. A reading is the effective resistance between
     two nodes, Z_uu + Z_kk − 2 Z_uk, plus the series resistances of the two wires. Z is the inverse of the

@@ -7,9 +7,9 @@ conductances directly. :class:`Paths` adds two effects:
 finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
                     where l₁ and l₂ are the distances to the nearest and farthest points of its rim
                     (Weber 1873; Jackson, Classical Electrodynamics, 3rd ed., problem 3.3). The conductance
-                    between two discs averages this potential over a parallel disc with the charge density
-                    1/√(a² − r²). Each of the two discs adds (a²/6) ∇²(1/d), where ∇² is the Laplacian in
-                    the plane. The average is therefore approximated by the potential of one disc of radius
+                    between two discs is the average of this potential over a parallel disc with the charge
+                    density 1/√(a² − r²). Each of the two discs adds (a²/6) ∇²(1/d), where ∇² is the Laplacian
+                    in the plane. The average is therefore approximated by the potential of one disc of radius
                     √2 a; the relative error is of order (a/d)⁴.
 strain              The resistivity ρ of a path becomes ρ (1 + β ε), where ε = d/d₀ − 1 is the strain of the
                     path relative to rest. This is the linear piezoresistive law (Smith, Phys. Rev. 94, 1954)
@@ -128,7 +128,7 @@ _unused: dict[tuple[int, ...], list[Float]] = {}
 def _borrowed(shape: tuple[int, ...]) -> Iterator[Float]:
     """Lend a work array to one thread at a time; patches of the same shape share the arrays.
 
-    The arrays are reused because mapping the pages of new arrays would take longer than the arithmetic.
+    The arrays are reused because mapping memory pages for new arrays would take longer than the arithmetic.
     """
     unused = _unused.setdefault(shape, [])
     try:

@@ -42,7 +42,7 @@ _OF_NETWORK: Final = (
     "multiplexer_ohm",
     "virtual_ground_ohm",
 )
-"""Resistances modelled only by the read-outs ``grounded`` and ``floating``."""
+"""Resistances modelled only by the ``grounded`` and ``floating`` read-outs."""
 _WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
 """Fields that are not sizes. They have no effect if every size is zero."""
 _BITS: Final = (8, 32)
@@ -57,7 +57,7 @@ class Imperfections:
     draws for the others.
 
     Raises:
-        ConfigError: If a value has the wrong type or is out of range, or if the read-out ``ideal`` is
+        ConfigError: If a value has the wrong type or is out of range, or if the ``ideal`` read-out is
             combined with a nonzero network resistance.
     """
 
@@ -96,8 +96,8 @@ class Imperfections:
 
     # --- read-out
     gain: float = 0.0
-    """Gain error of the amplifier, as a fraction of each resistance change from rest; drawn. Half of the
-    variance is common to the whole patch. The other half is independent for each upper wire."""
+    """Gain error of the amplifier, as a fraction of the change in each resistance from rest; drawn. Half of
+    the variance is common to the whole patch. The other half is independent for each upper wire."""
     offset: float = 0.0
     """Offset error of each upper wire's readings, as a fraction of the median resistance at rest; drawn."""
     readout: Readout = "ideal"
@@ -106,18 +106,18 @@ class Imperfections:
     ``floating``: one pair of wires is measured while all other wires float, so sneak paths are in parallel
     with the pair."""
     contact_ohm: float = 0.0
-    """Mean contact resistance at the connector of each wire, ohm. Each wire's resistance is drawn uniformly
+    """Mean contact resistance (ohms) at the connector of each wire. Each wire's resistance is drawn uniformly
     from 0.5 to 1.5 times the mean."""
     upper_wire_ohm: float = 0.0
-    """Resistance of an upper wire per electrode pitch, ohm. The section from the connector to the first
+    """Resistance of an upper wire per electrode pitch, in ohms. The section from the connector to the first
     electrode has the same resistance."""
     lower_wire_ohm: float = 0.0
-    """Resistance of a lower wire per electrode pitch, ohm. The section from the connector to the first
+    """Resistance of a lower wire per electrode pitch, in ohms. The section from the connector to the first
     electrode has the same resistance."""
     multiplexer_ohm: float = 0.0
-    """On-resistance of the multiplexer at each upper wire, ohm."""
+    """On-resistance of the multiplexer at each upper wire, in ohms."""
     virtual_ground_ohm: float = 0.0
-    """Input resistance of the amplifier at each lower wire, ohm; 0 for an ideal virtual ground."""
+    """Input resistance of the amplifier at each lower wire, in ohms; 0 for an ideal virtual ground."""
     row_time_s: float = 0.0
     """Time between the samples of neighbouring upper wires, in s."""
     noise: float = 0.0
@@ -130,7 +130,7 @@ class Imperfections:
         for name in ("seed", "bits"):
             value = getattr(self, name)
             if type(value) is not int or value < 0:
-                raise ConfigError(name, value, "an integer of at least 0")
+                raise ConfigError(name, value, "a non-negative integer")
         if self.bits and not _BITS[0] <= self.bits <= _BITS[1]:
             raise ConfigError("bits", self.bits, f"0, or an integer from {_BITS[0]} to {_BITS[1]}")
         if self.readout not in get_args(Readout):

@@ -32,7 +32,7 @@ class PhysicalPatch:
     only on time, not on earlier calls. Without imperfections, the resistances equal those of
     :class:`ExactForward` bit for bit.
 
-    The read-outs ``grounded`` and ``floating`` are simplified: the conductances of each upper wire's paths
+    The ``grounded`` and ``floating`` read-outs are simplified: the conductances of each upper wire's paths
     are taken at the sampling time of that wire, even while another upper wire is sampled. This affects only
     sneak currents.
 
@@ -144,7 +144,7 @@ class PhysicalPatch:
         return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
 
     def _warmth(self, t_s: float) -> Float:
-        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to that at time 0."""
+        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to time 0."""
         sizes = self.imperfections
         since_s = np.maximum(t_s + self._row_s, 0.0)
         risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)

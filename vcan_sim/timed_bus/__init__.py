@@ -10,7 +10,7 @@
 
 The caller supplies the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` simulates
 the bus up to a given time, and ``TimedBus.next_event_ns`` is the time at which to call ``advance`` next. The
-same calls always produce the same events. The modules ``bus``, ``attempt`` and ``confinement`` list the
+same calls always produce the same events. The ``bus``, ``attempt`` and ``confinement`` modules list the
 simplifications of the model.
 """
 

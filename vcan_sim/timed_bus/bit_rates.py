@@ -1,4 +1,4 @@
-"""Bit rates of a bus, and the tick, a unit of time in which every bit time is a whole number."""
+"""Bit rates of a bus, and the tick: a unit of time such that every bit time is a whole number of ticks."""
 
 from __future__ import annotations
 

@@ -310,7 +310,7 @@ class TimedBus:
         """Discard the record of the bus load before a given time, to free memory.
 
         Args:
-            before_ns: Start of the remaining record, ns. Later calls of :meth:`busy_share` must not refer to
+            before_ns: Start (ns) of the remaining record. Later calls of :meth:`busy_share` must not refer to
                 earlier times.
         """
         self._occupancy.forget(before_ns)

@@ -23,7 +23,7 @@ class _Fields(NamedTuple):
 
 
 class CanFrame(_Fields):
-    """Data frame or remote frame of classic CAN or CAN FD.
+    """Classic CAN or CAN FD data frame, or classic CAN remote frame.
 
     The error state indicator (ESI) of a CAN FD frame is not included, because the controller sets it:
     dominant in an error-active station, recessive in an error-passive station.

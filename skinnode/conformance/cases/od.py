@@ -72,7 +72,7 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
 
 @case(
     "OD-01",
-    "Every readable object from 0x1000 to 0x1FFF can be read, and its length is that of its data type",
+    "Every readable object from 0x1000 to 0x1FFF can be read, and has the length of its data type",
     "7.4, 7.5.2",
 )
 def read_communication(dut: Dut) -> None:
@@ -147,7 +147,7 @@ def limits(dut: Dut) -> None:
 
 @case(
     "OD-07",
-    "Every readable object from 0x2000 to 0x9FFF can be read, and its length is that of its data type",
+    "Every readable object from 0x2000 to 0x9FFF can be read, and has the length of its data type",
     "7.4",
 )
 def read_rest(dut: Dut) -> None:

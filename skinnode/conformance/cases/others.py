@@ -26,7 +26,7 @@ RESTRICTED = (
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Change 0x1015 and 0x1017; return the old and the new values, by index."""
+    """Change 0x1015 and 0x1017; return the old and the new values, keyed by index."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -70,7 +70,7 @@ def _store(dut: Dut, subindex: int) -> None:
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Check that the command to restore defaults takes effect at the next reset and not before."""
+    """Check that the command to restore defaults takes effect at the next reset, but not earlier."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
@@ -180,7 +180,7 @@ def restricted(dut: Dut) -> None:
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
-    """Yield index and sub-index of each writable COB-ID among SYNC, TIME, EMCY, first RPDO and first TPDO."""
+    """Yield the index and sub-index of each writable COB-ID: SYNC, TIME, EMCY, first RPDO, first TPDO."""
     pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
     for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
         entry = dut.eds.find(index, subindex)

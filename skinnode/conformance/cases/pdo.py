@@ -30,7 +30,7 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Time to wait after each SYNC for the first TPDO of a cycle before the next SYNC is sent, in s."""
+"""Time to wait for the first TPDO of a cycle after each SYNC, before sending the next SYNC, in s."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
@@ -108,7 +108,7 @@ def remote(dut: Dut) -> None:
 
 
 def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
-    """Configure a TPDO to be sent on request by a remote frame; return its CAN-ID and its length in bytes.
+    """Configure a TPDO to be sent in response to a remote frame; return its CAN-ID and its length in bytes.
 
     Raises Unsupported if bit 30 of the COB-ID disallows remote frames.
     """
@@ -157,7 +157,7 @@ def event_timer(dut: Dut) -> None:
         dut.nmt(PRE_OPERATIONAL)
         set_up(dut, pdo, PdoSetup(254, event_ms=_EVENT_MS))
         dut.operational()
-        frames = [expect_pdo(dut, can_id, length, f"{pdo} each {_EVENT_MS} ms") for _ in range(9)]
+        frames = [expect_pdo(dut, can_id, length, f"{pdo} every {_EVENT_MS} ms") for _ in range(9)]
         check_period(frames, _EVENT_MS, str(pdo), or_sooner=busy)
         if not busy:
             dut.sdo.write_integer(pdo.parameter, EVENT_TIMER, 0, 2)
@@ -209,7 +209,7 @@ def _after_sync(  # noqa: PLR0913 - one PDO, one SYNC
 
 @case(
     "PDO-07",
-    "OPERATIONAL: a TPDO of type 0 is sent only after a SYNC, and no later than after the third SYNC",
+    "OPERATIONAL: a TPDO of type 0 is sent only after a SYNC, and no later than the third SYNC",
     "7.2.2.2, 7.5.2.37",
 )
 def acyclic(dut: Dut) -> None:
@@ -252,7 +252,7 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
     return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
-# --- no PDO is sent in STOPPED, or in PRE-OPERATIONAL after OPERATIONAL
+# --- no PDO is sent in STOPPED, nor in PRE-OPERATIONAL after OPERATIONAL
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:

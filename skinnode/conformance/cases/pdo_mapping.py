@@ -59,7 +59,7 @@ def _any_for(dut: Dut, pdo: Pdo) -> EdsEntry:
 
 
 def _clear(dut: Dut, pdo: Pdo) -> int:
-    """Take the first steps of remapping: disable the PDO, then its mapping. Return the previous COB-ID."""
+    """Begin remapping: disable the PDO, then its mapping. Return the previous COB-ID."""
     cob_id = disable(dut, pdo)
     dut.sdo.write_integer(pdo.mapping, 0, 0, 1)
     return cob_id
@@ -227,7 +227,7 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
     """Check that the device refuses an invalid mapping.
 
-    The device may abort the write of the entry or the subsequent write of the number of entries.
+    The device may abort either the write of the entry or the subsequent write of the number of entries.
     """
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"

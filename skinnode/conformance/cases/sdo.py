@@ -24,7 +24,7 @@ TOO_LOW = (0x0609_0030, 0x0609_0032)
 
 _DEVICE_TYPE = 0x1000
 _HARMLESS = (HEARTBEAT, 0x1015, 0x1006, 0x1007, GUARD_TIME)
-"""CiA 301 objects to which any value can be written without an immediate effect."""
+"""CiA 301 objects that accept any value without an immediate effect."""
 _SPECIAL = (0x1003, 0x1010, 0x1011, 0x1020, 0x1F50, 0x1F51)
 """Objects that accept only commands or certain values."""
 _STRINGS = (0x1008, 0x1009, 0x100A)
@@ -33,7 +33,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
     """Return the first entry for which ``fits`` is true, excluding the objects in ``_SPECIAL``.
 
-    Raises NotApplicable if there is none; ``lack`` describes the missing object in the message.
+    Raises NotApplicable if there is none; in the message, ``lack`` describes the missing object.
     """
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:

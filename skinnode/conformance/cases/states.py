@@ -85,7 +85,7 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """Set the event timer of all TPDOs to 20 ms; return the length of each TPDO in bytes, by CAN-ID."""
+    """Set the event timer of all TPDOs to 20 ms; return the length of each TPDO in bytes, keyed by CAN-ID."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):
@@ -164,12 +164,12 @@ def stopped(dut: Dut) -> None:
     dut.nmt(PRE_OPERATIONAL)
     dut.expect_state(127, "after enter pre-operational")
     if dut.bus.take(dut.sdo.answer_id, QUIET_S) is not None:
-        raise Failed("no late response to an SDO request sent in STOPPED", "one")
+        raise Failed("no late response to an SDO request sent in STOPPED", "a response")
     dut.sdo.read(0x1000)
 
 
 def _no_emcy(dut: Dut) -> None:
-    """Check that an RPDO without data, an error only in OPERATIONAL, triggers no emergency message."""
+    """Check that an RPDO without data (an error only in OPERATIONAL) triggers no emergency message."""
     dut.bus.pending(dut.emcy_id)
     dut.bus.send(0x200 + dut.node_id)
     dut.bus.expect_silence(dut.emcy_id, "emergency message in STOPPED")

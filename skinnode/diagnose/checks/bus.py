@@ -17,8 +17,8 @@ _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
 """Fraction of out-of-sequence SYNC counters above which a second SYNC producer is reported.
 
-With two producers, about half of the counters do not follow the previous one. Lost SYNCs cause far fewer such
-counters.
+With two producers, about half of the counters are out of sequence. Lost SYNCs put far fewer counters out of
+sequence.
 """
 
 _BEATS: Final = 4
@@ -28,7 +28,7 @@ sender halves the measured period."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
-    """Check the interface, the controller, the load and frame origins; report nodes without a node-ID."""
+    """Check the interface, controller, load and frame origins; report nodes without a node-ID."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
@@ -60,7 +60,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "error frames on the bus",
             Sure.CERTAIN,
             f"{bus.error_frames} in {bus.seconds:.1f} s",
-            "check the termination, the length of the stubs, and the bit rate and power of each node",
+            "check the termination, the stub lengths, and each node's bit rate and power supply",
         )
     if bus.load > MAX_BUS_LOAD:
         yield found(

@@ -20,7 +20,7 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
         yield Finding(
             "nodes",
             bus.name,
-            "no node of the hand answers",
+            "none of the hand's nodes answers",
             Sure.CERTAIN,
             f"{counted(len(bus.patches), 'node')} queried, {counted(bus.frames, 'frame')} received "
             f"in {bus.seconds:.1f} s",

@@ -178,7 +178,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is much noisier than its neighbours, which a touch would also affect."""
+    """Return whether a wire is much noisier than its neighbours; a touch would affect these too."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
@@ -217,7 +217,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether no code changed but the stated noise is too small for this to prove a fault.
+    """Return whether all codes are constant but the stated noise is too small for this to prove a fault.
 
     Returns False if the patch counts its conversions, because the count shows whether the converter is
     running.
@@ -234,7 +234,7 @@ def _shows(scans: ScanFacts) -> bool:
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Return masks of the crossings with a value in every scan and of those whose value never changed."""
+    """Return two masks: crossings with a value in every scan, and crossings whose value never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 

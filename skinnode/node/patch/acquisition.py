@@ -1,4 +1,4 @@
-"""Reads the resistances of a patch from its analogue port, encodes them, and measures the baseline."""
+"""Reads the resistances of a patch from its analogue front end, encodes them, and measures the baseline."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
 """Number of readings averaged for a baseline. The noise of the baseline is then a quarter of the noise of a
-single reading, and the relative noise of R/R0 is only 3 % higher than that of R."""
+single reading, and the relative noise of R/R0 is only 3 % higher than the noise of R."""
 
 
 class Acquisition:
@@ -25,7 +25,7 @@ class Acquisition:
 
     Args:
         profile: Dimensions of the patch.
-        source: Analogue port of the patch.
+        source: Analogue front end of the patch.
         scale: Mapping of R/R0 to codes.
         baseline_ohm: (U, K) initial R0 in ohms; None if the patch has no baseline yet.
 
@@ -48,7 +48,7 @@ class Acquisition:
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
         """(U, K) baseline R0 in ohms with REAL32 precision, as in the object dictionary; 0 where unknown."""
         self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
-        """(U, K) codes of the last scan; before the first scan, all are open."""
+        """(U, K) codes of the last scan; before the first scan, all crossings are coded as open."""
         self.faults = WireFaults.none(profile)
         """Wire faults in the last scan."""
         self.phase = 0

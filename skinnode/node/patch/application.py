@@ -211,7 +211,7 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report the end of an overrun, because scans are no longer skipped."""
+        """Report the end of an overrun once scans are no longer skipped."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 

@@ -23,7 +23,7 @@ class ChunkSelection:
         self._since_full = 0  # number of scans since the last full scan
         self._full_scan_due = True
         self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
-        """(U, K) codes that were last sent; before the first scan, all are open."""
+        """(U, K) codes that were last sent; before the first scan, all crossings are coded as open."""
         self._largest_sent: int = scale.open
 
     def forget(self) -> None:

@@ -84,7 +84,7 @@ def bind_baseline(
 
 
 def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
-    """Return each sub-index's slice of the concatenated bytes of a record.
+    """Return, for each sub-index, its slice of the record's concatenated bytes.
 
     Args:
         store: Object dictionary.

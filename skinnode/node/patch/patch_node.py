@@ -25,8 +25,8 @@ class PatchNode(CanopenDevice):
     Args:
         node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
             memory takes precedence.
-        layout: Electrodes of the patch, which determine the sizes of the object dictionary.
-        source: Analogue port of the patch.
+        layout: Electrodes of the patch, which determine the dimensions in the object dictionary.
+        source: Analogue front end of the patch.
         send: Function that sends a frame, given its COB-ID and payload.
         profile: Wire format of the patch; by default, 16-bit codes on classic CAN.
         serial: Serial number (0x1018:4 and 0x2000:11), u32.

@@ -99,7 +99,7 @@ class ScanStream:
     def is_held_up(self, t_ns: int) -> bool:
         """Return whether the stream is sending more slowly than the inhibit time allows.
 
-        This happens if the thread gets too little processor time or the bus refuses frames.
+        This happens if the thread gets too little processor time or frames cannot be sent.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns
@@ -131,7 +131,7 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """Drop all scans without a summary because the node is leaving OPERATIONAL."""
+        """Drop all scans without a summary when the node leaves OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
@@ -171,7 +171,7 @@ class ScanStream:
             following, self._next_scan = self._next_scan, None
             try:
                 self._end(ended, t_ns)
-            finally:  # start the next scan even if the bus refuses the summary
+            finally:  # start the next scan even if the summary cannot be sent
                 if following is not None:
                     self._begin(following, t_ns)
 
@@ -204,7 +204,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # counted only now, because the bus may have refused the chunk
+            self._chunks_sent += 1  # counted only now, because sending the chunk may have failed
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Analogue port of a patch: interface to a resistance source, such as a converter or the simulator."""
+"""Analogue front end of a patch: interface to a resistance source, such as a converter or the simulator."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Reset the state and start the event timer because the node is entering OPERATIONAL."""
+        """Reset the state and start the event timer when the node enters OPERATIONAL."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
@@ -218,14 +218,14 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """Start all TPDOs because the node is entering OPERATIONAL."""
+        """Start all TPDOs when the node enters OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """Stop all TPDOs because the node is leaving OPERATIONAL."""
+        """Stop all TPDOs when the node leaves OPERATIONAL."""
         self._running = False
         self._timers.clear()
 

@@ -24,7 +24,7 @@ SEGMENT_NS: Final = 500_000
 
 The resulting rate of 2000 frames/s is below the 2200 frames/s available on a 1 Mbit/s bus with 70 % PDO load,
 so the transmit queue does not fill up. A block of 127 segments takes 64 ms, which is well within client
-time-outs (the canopen library waits 300 ms). Whenever the bus refuses a segment, for example at a lower bit
+time-outs (the canopen library waits 300 ms). Whenever a segment cannot be sent, for example at a lower bit
 rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
@@ -157,7 +157,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """Continue after the first ``received`` segments of the block, which the client has received."""
+        """Continue after the first ``received`` segments of the block, which the client has acknowledged."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)

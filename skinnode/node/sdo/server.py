@@ -1,6 +1,6 @@
 """SDO server (CiA 301 v4.2, 7.2.4.3) for expedited and segmented transfers.
 
-Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is no
+Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is not a
 substitute: it does not reject unknown commands and supports neither time-outs nor block transfers.
 """
 

@@ -6,7 +6,7 @@ wire contradicts the others, the frame is solved again without it. The check sto
 remains, or when :data:`ROUNDS` groups of readings have been left out.
 
 Fields of the exact inverse are tested a second time: the change since the last complete field
-(:mod:`skinnode.solve.checks.last_field`) must be that of a load as well.
+(:mod:`skinnode.solve.checks.last_field`) must also be consistent with a load.
 """
 
 from __future__ import annotations
@@ -39,17 +39,18 @@ SUSPICIOUS: Final = 5.0
 """Gain in log evidence from assuming a fault, in nats, above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads, in nats, below which loads clearly explain a frame. Similar
-frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
+"""Log evidence of faults minus log evidence of loads, in nats, below which loads clearly explain a frame.
+Similar frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
-"""Maximum excess (nats) of a frame's gain over that of an examined frame for the two frames to be similar."""
+"""Excess gain (nats) over an examined frame below which a frame is considered similar to it."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames for which the result of an examination also applies to similar frames. Each examination
 takes 9 ms."""
 SUSPICIOUS_CHANGE: Final = 20.0
 """Gain in log evidence from assuming that one reading is wrong, in nats, above which the change since the
-last field is suspicious. In 660 frames of moving loads at noise 1e-5, 1.4 % exceeded it, under an edge or
-a sphere; of 12 readings that displaced an electrode by more than 12 standard deviations, 10 did."""
+last field is suspicious. Of 660 frames of moving loads at noise 1e-5, 1.4 % exceeded this limit, under an
+edge or a sphere. Of 12 wrong readings that displaced an electrode by more than 12 standard deviations, 10
+exceeded it."""
 CROSSED_FRAMES: Final = 5
 """Number of frames for which a crossed pair is remembered. If either of its wires is found to be faulty again
 within this time, both wires are reported."""
@@ -60,9 +61,10 @@ reading can be so far off that the linearised readings of its whole wire appear 
 gain was at most 37 nats in 3,000 healthy frames (``bench trust --seed 1``); in longer streams, a few narrow
 presses exceed the limit."""
 RELINEARISED_MARGIN: Final = 200.0
-"""Minimum margin for a fault found about the field without the suspected reading, in nats. Without the
-reading, a narrow load is smoothed: in 1.2 million healthy frames at noise 1e-5, the margin reached 91 nats in
-six frames; for grossly wrong readings, it was 480 to 6,042 nats (``bench trust --seed 1``)."""
+"""Minimum margin, in nats, for a fault that is found by linearising about the field without the suspected
+reading. Without the reading, a narrow load is smoothed: in 1.2 million healthy frames at noise 1e-5, the
+margin reached 91 nats in six frames; for grossly wrong readings, it was 480 to 6,042 nats
+(``bench trust --seed 1``)."""
 UNRESOLVED_FRAMES: Final = 10
 """Number of frames after an unexplained contradiction during which a gain above :data:`RELINEARISED` makes a
 frame doubtful, even if loads seem to explain it."""
@@ -165,13 +167,13 @@ class DataCheck:
     ) -> FieldFrame:
         """Check the readings of a frame; return its field with the faults found and the trust decision.
 
-        If readings are found to be wrong, the returned field is that of a new solve without them.
+        If readings are found to be wrong, the returned field comes from a new solve without them.
 
         Args:
             solved: The frame, solved without the readings in :attr:`left_out`.
             solve_without: Function that solves the frame without the given readings (U, K) and without those
                 in :attr:`left_out`.
-            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A suspicious frame
+            until: Deadline (s) as a value of :func:`skinnode.process.clock.perf_counter`. A suspicious frame
                 that cannot be examined in time is not trusted; every :data:`PATIENCE`-th such frame is
                 examined regardless. Pass −inf if the solver ran out of time: wires without a solution are
                 then not considered faulty.
@@ -221,7 +223,7 @@ class DataCheck:
     def _search(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float
     ) -> tuple[Solved, list[Group], tuple[Group, ...]]:
-        """Solve a frame again without the readings that contradict the others, until there are none.
+        """Solve a frame again without contradictory readings, until none remain or the limit is reached.
 
         Returns:
             The frame as last solved, the groups of readings left out, and the groups that remain in the frame
@@ -276,7 +278,7 @@ class DataCheck:
     def _unusual_change(self, solved: Solved) -> Gains | None:
         """Return the gains from assuming a wrong reading if the change since the last field is suspicious.
 
-        The linearised readings are then those of the change.
+        The linearised readings then describe the change.
         """
         change = self._last_field.change(solved.field, self._frame)
         if change is None:
@@ -310,7 +312,7 @@ class DataCheck:
         return self._find_in_change(solved, until)
 
     def _find_in_change(self, solved: Solved, until: float) -> tuple[Group, ...]:
-        """Return the groups of readings whose changes since the last field contradict those of the others.
+        """Return the groups of readings whose changes since the last field contradict the other changes.
 
         Crossed wires are not reported, because they would have been found in the changes since rest; the
         frame is then doubtful.
@@ -380,7 +382,7 @@ class DataCheck:
     def _find_without(
         self, suspect: int, solved: Solved, solve_without: Callable[[Mask], Solved], until: float
     ) -> tuple[Solved, tuple[Group, ...]]:
-        """Search a frame for wrong readings, linearised about its field without the reading ``suspect``.
+        """Search a frame, linearised about its field without the reading ``suspect``, for wrong readings.
 
         Returns:
             The frame, solved with the suspect if no fault was found, and the groups of readings that
@@ -443,7 +445,7 @@ class DataCheck:
         self._list.follow(*self._readings.deviations(solved))
 
     def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
-        """Return ``groups`` without those from the coarse search whose readings agree with the field."""
+        """Return ``groups`` without the groups from the coarse search whose readings agree with the field."""
         if not self._coarse:
             return groups
         deviation, known = self._readings.deviations(solved)

@@ -7,14 +7,14 @@ from typing import Final
 from skinnode.process.clock import perf_counter
 
 PATIENCE: Final = 4
-"""Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
-makes every subsequent frame suspicious; a press rarely does."""
+"""Number of suspicious frames after which one is examined even if the deadline leaves no time. A fault makes
+every subsequent frame suspicious; a press rarely does."""
 FIRST_S: Final = 3e-3
 """Assumed duration of the first examination, in s. Later examinations are timed."""
 
 
 class ExaminationTime:
-    """Time that examinations take, and the suspicious frames that there was no time to examine.
+    """Duration of examinations, and the number of suspicious frames not examined for lack of time.
 
     Attributes:
         expected_s: Expected duration of an examination, in s.
@@ -26,7 +26,7 @@ class ExaminationTime:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames that were not examined."""
+        """Reset the count of unexamined frames."""
         self._waiting, self.is_overdue = 0, False
 
     def start_frame(self) -> None:
@@ -38,11 +38,11 @@ class ExaminationTime:
         self._waiting = 0
 
     def insist(self) -> None:
-        """Let the next suspicious frame be examined, whether or not there is time."""
+        """Force the examination of the next suspicious frame, even if there is no time."""
         self._waiting = PATIENCE
 
     def allows(self, until: float, seconds: float | None = None) -> bool:
-        """Return whether a step of a suspicious frame may be started.
+        """Return whether a step in the examination of a suspicious frame may start.
 
         The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would miss it.
 
@@ -59,7 +59,7 @@ class ExaminationTime:
         return self.is_overdue
 
     def is_in_time(self, until: float, seconds: float | None = None) -> bool:
-        """Return whether a step that takes ``seconds`` ends by ``until``, or the frame is overdue."""
+        """Return whether a step of ``seconds`` would end by ``until``, or the frame is overdue."""
         seconds = self.expected_s if seconds is None else seconds
         return self.is_overdue or perf_counter() + seconds <= until
 

@@ -4,9 +4,9 @@ A frame can be unlikely under the elastic prior for three reasons: some readings
 crossed, or the loads are unusual, such as a contact much narrower than the patch. A greedy search, similar to
 orthogonal matching pursuit, builds an explanation step by step. Each step adds the load or the group of wrong
 readings with the largest gain in log evidence. An explanation with faults is accepted only if its log
-evidence exceeds that of the best explanation by loads alone by more than :data:`MARGIN`. The same margin
-applies to crossed wires, whose log evidence is that of loads alone after the readings of the two wires have
-been exchanged.
+evidence exceeds the log evidence of the best explanation without faults by more than :data:`MARGIN`. The same
+margin applies to crossed wires. Their log evidence is computed for loads alone, after the readings of the two
+wires have been exchanged.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 MARGIN: Final = 40.0
-"""Minimum margin for a fault to be reported, nats. The margin is the log evidence with faults minus that of
-loads alone. In 1.9 million healthy frames, presses on the border of a patch reached 29 nats (``bench trust
---seed 1 --only hours``)."""
+"""Minimum margin for reporting a fault, in nats. The margin is the log evidence with faults minus the log
+evidence of loads alone. In 1.9 million healthy frames, the margin reached 29 nats in presses on the border of
+a patch (``bench trust --seed 1 --only hours``)."""
 MARGIN_OF_WIRE: Final = 20.0
-"""Minimum margin for a wire that contradicts the others to be reported, nats. At this value, no faults were
+"""Minimum margin for reporting a wire that contradicts the others, in nats. At this value, no faults were
 reported in 6,800 healthy frames of deep slides (noise 3e-6), nor in 270 frames with six kinds of presses
 (noise 1e-5). A smaller margin does not make a frame doubtful."""
 MARGIN_OF_READING: Final = 100.0
-"""Minimum margin for a single wrong reading to be reported, nats. In 1.2 million healthy frames at noise
-1e-5, two presses reached 77 and 87 nats (``bench trust --seed 1 --only hours --hours 10``)."""
+"""Minimum margin for reporting a single wrong reading, in nats. In 1.2 million healthy frames at noise 1e-5,
+the margin reached 77 and 87 nats in two presses (``bench trust --seed 1 --only hours --hours 10``)."""
 DOUBT: Final = 5.0
-"""Minimum margin for a frame to be doubtful, nats. In 144 healthy frames, the margin over explanations by up
-to 8 loads was never positive."""
+"""Minimum margin at which a frame is considered doubtful, in nats. In 144 healthy frames, the margin over
+explanations by up to 8 loads was never positive."""
 SCALES: Final = 4
 """Number of prior scales searched for explanations: the best-fitting scale and smaller ones. A wrong reading
 can inflate the best-fitting scale by a factor of up to 2⁴, a narrow contact by up to 2³."""
 STRIDE: Final = 2
 """Step in log2 κ between the prior scales that are searched."""
 HOPELESS: Final = 150.0
-"""Log evidence of loads minus that of faults at one prior scale, in nats, above which smaller scales are not
-searched for faults. In 163 frames with a fault, the difference was at most 114 nats."""
+"""Difference between the log evidence of loads and of faults at one prior scale, in nats, above which smaller
+scales are not searched for faults. In 163 frames with a fault, the difference was at most 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
 
@@ -86,9 +86,10 @@ class Explainer:
         self._search = GreedySearch(model)
         self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
         self.margin = -math.inf
-        """Margin of the last frame, nats: log evidence with faults minus that of loads or more noise."""
+        """Margin of the last frame, in nats: log evidence with faults minus log evidence with loads or more
+        noise."""
         self.is_noisier = False
-        """Whether more noise than stated explains the last frame better than loads do."""
+        """Whether noise above the stated level explains the last frame better than loads do."""
 
     def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
         self,
@@ -108,7 +109,7 @@ class Explainer:
             present: (U, K) mask of the readings to use.
             evidence: (L,) log evidence of the frame at each κ.
             best: Index of the κ with the largest log evidence.
-            cost: Log evidence subtracted for each wrong reading, nats: the logarithm of its expected error
+            cost: Log evidence subtracted for each wrong reading, in nats: the logarithm of its expected error
                 divided by the noise.
             sigma: Relative noise of the readings.
             noisier: Log evidence of the frame, assuming noise above the stated level and no faults.

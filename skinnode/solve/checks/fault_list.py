@@ -80,8 +80,8 @@ class FaultList:
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
         """Record the groups of wrong readings in a frame and return the faults that are not yet confirmed.
 
-        Crossed wires are only reported once they are confirmed: they stay crossed, whereas a press that a
-        wire has not followed can resemble an exchange for one frame.
+        Crossed wires are reported only after confirmation: they stay crossed, whereas a press that one wire
+        does not show yet can resemble crossed wires for one frame.
 
         Args:
             groups: Groups of wrong readings.

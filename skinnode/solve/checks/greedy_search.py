@@ -30,7 +30,7 @@ LOADS: Final = 60
 loads each. With a maximum of 8, half of the healthy frames of a deep slide were reported as faulty (noise
 3e-6)."""
 ENOUGH: Final = 1.0
-"""Minimum gain in log evidence (nats) for a load or a group of wrong readings to be added."""
+"""Minimum gain in log evidence (nats) for adding a load or a group of wrong readings."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
 """Kinds of search steps: add a load; leave out one reading; leave out all readings of a lower wire, or of an
 upper wire."""
@@ -60,7 +60,7 @@ class GreedySearch:
     def run(  # noqa: PLR0913 - the frame, and which explanations are allowed
         self, number: int, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
     ) -> float:
-        """Find the best explanation of a frame, store its steps in the attributes, and return its gain, nats.
+        """Find the best explanation of a frame, store its steps as attributes and return its gain in nats.
 
         Args:
             number: Index of κ.
@@ -199,7 +199,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Update the search vectors for step ``count``, which adds a load or leaves out a reading.
 
-    ``item`` is the index of the load or reading among the columns of A. A load is given its most likely
+    ``item`` is the index of the load or reading among the columns of A. A load is assigned its most likely
     variance (b² − h) / h², where b is its element of Aᵀ P z and h its diagonal element of E. Elements before
     ``first`` are not updated.
     """
@@ -259,7 +259,7 @@ def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -
 
 @njit
 def _best_load(weighted: Float, diagonal: Float, m: int, least: float) -> tuple[float, int]:
-    """Return the largest gain from adding a load, and the load's index; −1 if no load has a gain."""
+    """Return the largest gain from adding a load, and the load's index; −1 if no load yields a gain."""
     most, number = 1.0, -1
     for j in range(m, diagonal.size):
         if diagonal[j] > least:
@@ -295,7 +295,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     numbers: Index,
     gains: Float,
 ) -> float:
-    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain, in nats."""
+    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain in nats."""
     m = z.size
     multiply_vector(p, z, weighted[:m])
     multiply_vector(response_t, weighted[:m], weighted[m:])

@@ -16,7 +16,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 AGE: Final = 5
-"""Maximum age of the last field, frames. A reading that is wrong in every frame is confirmed after three
+"""Maximum age of the last field, in frames. A reading that is wrong in every frame is confirmed after three
 frames; until then, each frame is compared with the last field before the error."""
 
 

@@ -1,7 +1,7 @@
-"""Changes in the readings of one frame, linearised at rest, and how likely faults explain them.
+"""Changes in the readings of one frame, linearised at rest, and the evidence that they are due to faults.
 
 Displacements of the electrodes change the logarithms of the readings by J u. For a converged field of the
-exact inverse, J u contains all that the readings say; for other fields, the residuals are added.
+exact inverse, J u contains all the information in the readings; for other fields, the residuals are added.
 :class:`LinearisedReadings` computes these changes z in units of the noise, and the log evidence that
 :mod:`skinnode.solve.checks.reading_model` assigns to them.
 """
@@ -65,7 +65,7 @@ class Gains:
 
     @property
     def largest(self) -> float:
-        """The larger of both gains."""
+        """Larger of the two gains."""
         return max(self.readings, self.wires)
 
 
@@ -117,7 +117,7 @@ class LinearisedReadings:
         return math.log(max(WRONG / self.sigma, math.e))
 
     def set_complete(self, moved_m: Float, sigma: float) -> None:
-        """Set the changes to those by the displacements ``moved_m`` (U, 3N), metres; all readings are used.
+        """Compute the changes due to the displacements ``moved_m`` (U, 3N), in metres; use all readings.
 
         Args:
             moved_m: Displacements that the exact inverse computed from all readings.
@@ -128,7 +128,7 @@ class LinearisedReadings:
         self._fit()
 
     def set_frame(self, solved: Solved, present: Mask) -> None:
-        """Set the changes since rest to those of a frame, linearised about its field."""
+        """Compute the changes of a frame since rest, linearised about its field."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
@@ -148,10 +148,10 @@ class LinearisedReadings:
         self._fit()
 
     def set_raw(self, solved: Solved) -> bool:
-        """Set the changes to the logarithms of the readings over those at rest, without a field.
+        """Compute the changes from the ratios of rest readings to current readings, without a field.
 
         Returns:
-            False if fewer than half of the readings are usable, in which case the changes are not set.
+            False if fewer than half of the readings are usable, in which case the changes are not valid.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self.z)

@@ -47,8 +47,8 @@ class GainArrays(ArrayTable):
     variances: Annotated[NDArray[np.float64], "2"]
     """Largest variance of a wire's gain about its layer's mean, and variance of the mean change."""
     settled: Annotated[NDArray[np.float64], "3"]
-    """Growth of a wire's variance and of the patch's variance at the last update; then 1 if this update left
-    the covariance unchanged, otherwise 0."""
+    """Growth of a wire's variance and of the patch's variance at the last update, followed by 1 if this
+    update left the covariance unchanged, otherwise 0."""
     beyond: Annotated[NDArray[np.float64], "m"]
     """Work array."""
     inverse: Annotated[NDArray[np.float64], "V V"]

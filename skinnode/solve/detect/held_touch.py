@@ -9,7 +9,7 @@ touch therefore ends in one of four ways:
 - a small fraction of the touch remains and stays constant, because the rubber creeps;
 - the readings have agreed with the rest values, to within the drift, for half an hour.
 
-A held press, however slight, meets none of these conditions for ten minutes.
+Even a slight press that is held for ten minutes meets none of these conditions.
 """
 
 from __future__ import annotations

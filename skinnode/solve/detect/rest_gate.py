@@ -1,6 +1,6 @@
 """Gate between the touch detector and the solvers: an untouched patch is not solved.
 
-The field of an untouched patch is zero. Its standard deviations, statuses and trust are those of the last
+The field of an untouched patch is zero. Its standard deviations, statuses and trust are taken from the last
 solved frame that was untouched, converged and trusted, with the same usable readings and the same noise. The
 gate opens for every frame that is touched or doubtful, or contains an unusual reading or wire, so that the
 data check examines it. The gate stays open while readings are left out because of a fault.
@@ -26,10 +26,10 @@ from skinnode.solve.wires.problem import PatchProblem
 NOISIER: Final = 1.25
 """Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
 GAP_S: Final = 2.0
-"""Time between two frames, s, above which the detector counts the frames that are missing between them. In a
-shorter time, the drift is too small to matter."""
+"""Interval between two frames, in s, above which the detector counts the missing frames. Over a shorter
+interval, the drift is negligible."""
 SAME: Final = 0.1
-"""Maximum relative change in noise that leaves a rest field valid."""
+"""Maximum relative change in noise for which a rest field remains valid."""
 
 
 class RestGate:
@@ -41,7 +41,7 @@ class RestGate:
 
     Attributes:
         detector: Touch detector of the patch.
-        t_ns: Time of the next frame, ns; None if unknown. Without times, gaps in the stream are not noticed.
+        t_ns: Time of the next frame, in ns; None if unknown. Without times, gaps in the stream go unnoticed.
     """
 
     def __init__(self, layout: PatchLayout, options: TrackerOptions) -> None:
@@ -88,7 +88,7 @@ class RestGate:
         """Return a frame's field if the frame need not be solved; None if it must be solved.
 
         Args:
-            ohm: (U, K) resistances, ohm.
+            ohm: (U, K) resistances, in ohms.
             valid: (U, K) bool: False for missing readings; None if no readings are missing.
             noise: (U, K) relative noise of this frame; None for the stated noise.
             left_out: (U, K) bool: True for faulty readings; None if no readings are faulty.

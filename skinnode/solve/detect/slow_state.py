@@ -30,7 +30,7 @@ BLOCK_S: Final = 0.25
 BLOCK: Final = 4
 """Minimum number of frames in a block."""
 HELD_BACK: Final = 2.0
-"""Maximum age of the newest frame in the estimate while the patch is untouched, blocks."""
+"""Maximum age of the newest frame in the estimate while the patch is untouched, in blocks."""
 FINER: Final = math.sqrt(2.0)
 """Ratio between successive drift levels distinguished by the detector."""
 PRIOR: Final = 8.0
@@ -52,7 +52,7 @@ START_S: Final = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Facts about a stream that its slow state requires."""
+    """Parameters of a stream that its slow state requires."""
 
     filter: GainFilter
     """Filter for the gains."""
@@ -71,7 +71,7 @@ class SlowState:
     """Slow state of one stream.
 
     Args:
-        stream: Facts about the stream.
+        stream: Parameters of the stream.
         shape: Numbers U and K of upper and lower wires.
 
     Attributes:
@@ -280,7 +280,7 @@ class SlowState:
         sums = 0.0
         for moved, count, other in ((by_rows, upper, lower), (by_columns, lower, upper)):
             if count > 1:
-                about = moved - common  # the mean over rows, or over columns, is that of all readings
+                about = moved - common  # the row means, or column means, average to the mean of all readings
                 variance = float(about @ about) / (count - 1) - of_noise / other
                 sums += variance * other / (upper + lower)
         found = sums / seconds

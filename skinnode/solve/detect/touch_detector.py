@@ -49,7 +49,7 @@ QUIETER: Final = 0.6
 """Ratio of a touched frame's noise variance to the average below which the average is considered too
 large."""
 NOISE_STEP: Final = 1.25
-"""Maximum factor between the average and a frame's noise variance; larger deviations are clipped."""
+"""Maximum ratio between the average and a frame's noise variance; larger deviations are clipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class TouchVerdict:
     touched: bool | None
     """Whether the patch is touched; None if too few readings are usable."""
     odds: float
-    """Odds of touch to no touch; see :attr:`skinnode.FieldFrame.touch_odds`."""
+    """Odds of touch versus no touch; see :attr:`skinnode.FieldFrame.touch_odds`."""
     quiet: bool
     """Whether the frame need not be solved, because the patch is untouched and no reading is unusual."""
 
@@ -69,7 +69,8 @@ class TouchDetector:
 
     Args:
         layout: The patch.
-        baseline_ohm: (U, K) resistances at rest, ohm. Crossings without a positive, finite value are ignored.
+        baseline_ohm: (U, K) resistances at rest, in ohms. Crossings without a positive, finite value are
+            ignored.
         noise: (U, K) relative standard deviation of the readings, excluding quantization.
         rounding: (U, K) relative standard deviation of the quantization error.
         period_s: Scan period, in s.
@@ -235,7 +236,7 @@ class TouchDetector:
         """Decide whether the patch is touched in the next frame.
 
         Args:
-            ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
+            ohm: (U, K) resistances, in ohms; values that are not positive and finite are ignored.
             valid: (U, K) bool: False for readings to ignore; None to use all readings.
             noise: (U, K) relative noise of this frame, including quantization; None for the usual noise.
         """

@@ -24,9 +24,9 @@ class TouchArrays(ArrayTable):
     """Arrays of one patch's detector. Changes y are in units of each reading's noise."""
 
     ohm: Annotated[NDArray[np.float64], "U K"]
-    """Resistances of the frame, ohm; NaN where missing."""
+    """Resistances of the frame, in ohms; NaN where missing."""
     rest: Annotated[NDArray[np.float64], "U K"]
-    """Resistances at rest, ohm."""
+    """Resistances at rest, in ohms."""
     weight: Annotated[NDArray[np.float64], "U K"]
     """1 / σ of each reading, or less if the frame is noisier than usual; 0 for readings to ignore."""
     expected: Annotated[NDArray[np.float64], "U K"]

@@ -1,4 +1,4 @@
-"""Odds of touch to no touch, updated each frame by Bayes' rule for a patch that is touched occasionally."""
+"""Odds of touch versus no touch, updated by Bayes' rule in each frame, for a patch touched occasionally."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from skinnode.model.layout import Float
 from skinnode.solve.detect.touch_statistic import DEPTH, MOST_OCTAVES, SHALLOWEST, Statistic
 
 DEEPEST: Final = 0.16
-"""Maximum RMS normal displacement considered in the odds, in layer heights."""
+"""Maximum RMS normal displacement considered in the odds, as a multiple of the layer height."""
 TOUCHES_PER_S: Final = 1.0 / 60.0
-"""Prior rate of touches, 1/s."""
+"""Prior rate of touches, in 1/s."""
 TOUCH_S: Final = 1.0
 """Prior mean duration of a touch, in s."""
 
@@ -25,7 +25,7 @@ def octaves_for(noise: float) -> int:
 
 
 def log_likelihood_ratio(statistic: Statistic, octaves: int, z: Float) -> float:
-    """Return a frame's log likelihood ratio of touch to no touch, given its z (r,) from ``statistic``.
+    """Return a frame's log likelihood ratio of touch versus no touch, given its z (r,) from ``statistic``.
 
     All ``octaves`` of depth are equally likely.
     """

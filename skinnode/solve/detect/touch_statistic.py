@@ -3,7 +3,7 @@
 Let y = ln(R₀/R)/σ be the changes in the readings from rest, in units of their noise, after subtraction of the
 estimated gains. Without a touch, y ~ N(0, V₀), where V₀ = I + H P Hᵀ includes the noise and the errors in the
 gains (:mod:`skinnode.solve.detect.gain_drift`). Loads change y by B q with q ~ N(0, 1), where B is the
-readings' response to loads at a depth that is almost hidden by noise. A touched frame therefore has
+readings' response to loads whose displacement is almost hidden by noise. A touched frame therefore has
 y ~ N(0, V₀ + B Bᵀ), and its likelihood ratio depends on
 
     T = yᵀ (V₀⁻¹ − (V₀ + B Bᵀ)⁻¹) y
@@ -35,9 +35,9 @@ from skinnode.solve.detect.gain_drift import effect_of
 from skinnode.solve.posterior.load_cells import LoadCells
 
 DEPTH: Final = 5.0
-"""RMS normal displacement under the alternative hypothesis, in layer heights times the relative noise. At a
-noise of 1e-3, this is 0.5 % of the layer height. Values from 0.25 % to 1 % work almost equally well; with 2 %
-or more, the test misses more of the presses that are 2 % deep."""
+"""RMS normal displacement under the alternative hypothesis, in units of the layer height times the relative
+noise. At a noise of 1e-3, this is 0.5 % of the layer height. Values from 0.25 % to 1 % work almost equally
+well; with 2 % or more, the test misses more of the presses that are 2 % deep."""
 SHALLOWEST: Final = 0.5
 """Minimum RMS normal displacement considered in the odds, relative to the alternative hypothesis."""
 MOST_OCTAVES: Final = 24
@@ -156,7 +156,7 @@ def _responses(layout: PatchLayout) -> Float:
     at_kappa = float(model.kappa[len(model.kappa) // 2])
     values = np.maximum(1.0 / model.shrink[len(model.kappa) // 2] - 1.0, 0.0) / at_kappa**2
     best = np.argsort(values)[::-1][:MOST_VECTORS]
-    kappa = DEPTH * LoadCells.of(layout).height_m / layout.pitch_m  # depth divided by the noise, pitches
+    kappa = DEPTH * LoadCells.of(layout).height_m / layout.pitch_m  # depth divided by the noise, in pitches
     share = kappa * np.sqrt(values[best])
     kept = share**2 > min(LEAST_WEIGHT, 0.5 * float(share.max()) ** 2)
     return np.asarray((model.vectors_t[best].T)[:, kept] * share[kept])

@@ -1,6 +1,6 @@
 """Exact tracker: solves each upper wire of a live stream, starting at its solution for the previous frame.
 
 ``tracker`` runs the stages of a solve. ``stream`` contains the arrays of a stream and the acceptance test for
-roots. ``recover_lost_wires`` makes further attempts for wires that failed. ``fixed_coordinates`` reduces the
-number of unknowns. ``contacts`` estimates loads and contacts from a solved field.
+roots. ``recover_lost_wires`` retries wires that failed. ``fixed_coordinates`` reduces the number of unknowns.
+``contacts`` estimates loads and contacts from a solved field.
 """

@@ -56,7 +56,7 @@ SCALE_STEPS: Final = 30
 SCALE_CLOSE: Final = 0.01
 """Relative change in s² at which the iteration stops; the relative change in the loads is smaller."""
 SCALE_LEAST: Final = 1e-12
-"""Lower limit of s², pitch²."""
+"""Lower limit of s², in pitch²."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +135,7 @@ class ExactContacts:
         self._without: tuple[bytes, float, float, Float, Float] | None = None
 
     def add(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with its contacts and, unless the option ``stiffness_n_per_m`` is set, its forces.
+        """Return the field with its contacts and, unless the ``stiffness_n_per_m`` option is set, its forces.
 
         Wires with an infinite standard deviation are ignored. If every wire is ignored, there are no contacts
         and all forces are zero.

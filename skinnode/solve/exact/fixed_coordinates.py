@@ -1,4 +1,4 @@
-"""Fixed coordinates of the exact tracker: the options ``normal_only`` and ``active_only``.
+"""Fixed coordinates of the exact tracker: the ``normal_only`` and ``active_only`` options.
 
 Both options reduce the number of unknowns. The coordinates that are not unknowns are fixed at rest.
 
@@ -6,8 +6,8 @@ Both options reduce the number of unknowns. The coordinates that are not unknown
 
 ``active_only`` fixes the electrodes not moved by a contact. At first, all electrodes of a wire are fixed.
 While the χ² test rejects the fit, the fixed electrode that explains most of the residual becomes an unknown,
-together with its neighbours. Once more than half of the electrodes would be unknowns, all of them become
-unknowns. When the rest position explains a frame again, all electrodes are fixed again.
+together with its neighbours. If more than half of the electrodes would become unknowns, all of them do. When
+the rest position explains a frame again, all electrodes are fixed again.
 
 The standard deviation of a fixed coordinate is the smallest movement that the χ² test would detect if no
 other electrode moved. To first order at rest, this is √(quantile − degrees of freedom) σ / ‖c‖, where c is
@@ -52,7 +52,7 @@ to prevent overflow."""
 
 
 class LeftOut:
-    """Fixed coordinates of a stream, and the smallest movements of these coordinates that would be detected.
+    """Fixed coordinates of a stream, and the smallest detectable movements of these coordinates.
 
     Args:
         stream: State of the stream.
@@ -90,7 +90,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Fix the wires at rest within the noise; write the standard deviations of fixed coordinates."""
+        """Fix wires at rest to within the noise; write the standard deviations of fixed coordinates."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest

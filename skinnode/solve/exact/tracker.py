@@ -7,7 +7,7 @@ Each wire passes through these stages until one of them finds a root of F = b:
 - follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough (module ``follow``);
 - correct: iterate the operator to a tolerance far below any noise (module ``correct``);
 - widen: make a fixed electrode an unknown if it seems to move (module ``fixed_coordinates``);
-- recover: make further attempts if no root was found (module ``recover_lost_wires``).
+- recover: retry the wire if no root was found (module ``recover_lost_wires``).
 
 :mod:`skinnode.solve.roots` defines which roots are acceptable.
 """
@@ -39,9 +39,9 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Upper bound on the time for one solver step, including one evaluation of F and J, seconds.
+"""Upper bound on the time for one solver step, including one evaluation of F and J, in seconds.
 
-Each call of the solver processes all wires that are certain to finish before the deadline. Ten calls instead
+Each call to the solver processes all wires that are certain to finish before the deadline. Ten calls instead
 of one would cost as much extra time as solving ten more wires.
 """
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
@@ -57,10 +57,10 @@ class ExactTracker:
         layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
         relative_noise: Relative standard deviation of R, scalar or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors in resistivity and gain
+        baseline_ohm: (U, K) resistances measured at rest, in ohms. If given, errors in resistivity and gain
             cancel.
-        stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, N/m. If given, each field contains
-            the forces F.
+        stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, in N/m. If given, each field
+            contains the forces F.
         hold: Whether to keep the last position of a wire while its resistances change by no more than their
             noise.
         deadline_us: Time limit for an update, in µs; an update can exceed it by the time needed for one wire.
@@ -148,7 +148,7 @@ class ExactTracker:
         """Return the displacement field of one frame.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
+            frame_ohm: (U, K) resistances, in ohms; values that are not positive and finite are ignored.
             valid: (U, K) bool, False for missing readings; default: all True.
             relative_noise: Relative standard deviation of the resistances of this frame, scalar or (U, K);
                 default: as in the constructor. A resistance is ignored if its standard deviation is not
@@ -263,7 +263,7 @@ class ExactTracker:
         return sigma, found
 
     def _rescue(self, frame: Frame) -> Float:
-        """Make further attempts for wires without an acceptable root; return the residuals (U,).
+        """Retry the wires without an acceptable root; return the residuals (U,).
 
         Updates ``good`` and ``status`` in :attr:`arrays`.
         """

@@ -19,8 +19,8 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 ) -> None:
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
-    The algorithm is that of Golub & Van Loan, section 5.4.8, with rows and columns exchanged. The squares of
-    the elements of A must not overflow.
+    The algorithm follows Golub & Van Loan, section 5.4.8, with rows and columns exchanged. The squares of the
+    elements of A must not overflow.
 
     Args:
         a: A, padded with zeros to (n + 3, m), with m rounded up to whole SIMD vectors. The padding allows
@@ -55,7 +55,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         for j in range(0, column.size, LANES):
             store(column, j, LANES, splat(0.0))
         square = 0.0
-        for i in range(k + 1, n, 4):  # apply the reflector of the row, and accumulate that of the column
+        for i in range(k + 1, n, 4):  # apply the row's reflector, and accumulate the column's reflector
             t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
             s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(first, end, LANES):

@@ -97,7 +97,7 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 def _forward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows − 1 of a tile of ``b`` with those of L⁻¹ B.
+    """Replace rows r to r + rows − 1 of a tile of ``b`` with the same rows of L⁻¹ B.
 
     Rows ``low`` to r − 1 of the tile must already have been replaced.
     """
@@ -165,7 +165,7 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 def _backward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows − 1 of a tile of ``b`` with those of L⁻ᵀ B.
+    """Replace rows r to r + rows − 1 of a tile of ``b`` with the same rows of L⁻ᵀ B.
 
     All later rows of the tile must already have been replaced.
     """

@@ -35,7 +35,7 @@ def dogleg_step(w: Work) -> None:
         weight = w.scale[j] ** 2
         a += weight * leg * leg
         b += weight * leg * w.step[j]
-    if a == 0.0:  # the Cauchy point is the Newton point, which is always so with one unknown
+    if a == 0.0:  # the Cauchy and Newton points coincide, as they always do with one unknown
         return
     root = math.sqrt(b * b - a * c)
     share = min(-c / (b + root) if b > 0.0 else (root - b) / a, 1.0)

@@ -14,7 +14,7 @@ Newton correction with the current factors satisfies ‖J⁻¹ r₊‖∞ ≤ to
 r above tol_f, an r within the rounding error of J·x counts as zero.
 
 For a tall system, CONVERGED means a root or a minimum. At a minimum, ‖P r‖ ≤ tol_f ‖r‖, where P projects onto
-the range of J, and the correction meets the second condition above. The module ``minimum`` distinguishes
+the range of J, and the correction meets the second condition above. The ``minimum`` module distinguishes
 minima from saddle points.
 
 A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
@@ -73,7 +73,7 @@ def begin(w: Work) -> int:
     s, flag = w.s, w.flag
     for k in range(flag.size):
         flag[k] = 0
-    s[RADIUS] = -1.0  # negative, so that the first call of propose sets the radius
+    s[RADIUS] = -1.0  # negative, so that the first call to propose sets the radius
     s[LAM] = 0.0
     s[ERROR] = math.inf
     s[ANGLE] = 1.0

@@ -1,4 +1,4 @@
-"""Result of ``solve_system``. The statuses are those of a displacement field."""
+"""Result of ``solve_system``. The statuses are the same as for a displacement field."""
 
 from __future__ import annotations
 

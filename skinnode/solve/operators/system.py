@@ -32,10 +32,10 @@ from skinnode.solve.operators.minimum import Point
 from skinnode.solve.operators.result import PointKind, Solution
 
 TURN: Final = 100
-"""Number of steps in the first turn of each attempt; each later turn has twice as many.
+"""Number of steps in the first turn of each attempt; each later turn has twice as many as the turn before.
 
-With column scaling, the operators converge from 90 of 138 starting points of 46 problems of Moré, Garbow &
-Hillstrom. In 79 (dogleg) or 72 (Levenberg-Marquardt) of these 90 cases, 100 steps are enough.
+With column scaling, the operators converge from 90 of the 138 starting points in 46 problems by Moré, Garbow
+& Hillstrom. In 79 (dogleg) or 72 (Levenberg-Marquardt) of these 90 cases, 100 steps are enough.
 """
 RADII: Final = (1.0, 0.1)
 """Initial trust radii of the attempts with D = I, relative to ‖x₀‖. From some starting points, only one of

@@ -1,9 +1,9 @@
 """Workspace for a solve, and products with its Jacobian.
 
-The symbols are those of the paper: the residual r (m,), its Jacobian J (m, n), which is stored transposed,
-and the Levenberg-Marquardt parameter lam. The trust region of a step s is ‖D s‖ ≤ radius. The diagonal of D
-is the running maximum of the column norms of J (Moré 1978), which makes the solve independent of the units of
-the unknowns. In the second and third attempts of ``solve_system``, D is the identity.
+The symbols follow the paper: the residual r (m,), its Jacobian J (m, n), which is stored transposed, and the
+Levenberg-Marquardt parameter lam. The trust region of a step s is ‖D s‖ ≤ radius. The diagonal of D is the
+running maximum of the column norms of J (Moré 1978), which makes the solve independent of the units of the
+unknowns. In the second and third attempts of ``solve_system``, D is the identity.
 """
 
 from __future__ import annotations

@@ -110,10 +110,10 @@ def solve_path(
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).
-        samples_ohm: (T, U, K) resistances, ohm, in time order; the last sample is the frame to solve.
+        samples_ohm: (T, U, K) resistances in ohms, in time order; the last sample is the frame to solve.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
         schedule: Step control: ``Uniform()`` (default), ``Periodic()`` or ``Adaptive()``.
-        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors in resistivity and gain
+        baseline_ohm: (U, K) resistances measured at rest, in ohms. If given, errors in resistivity and gain
             cancel.
 
     Returns:

@@ -54,9 +54,9 @@ def doubtful(tracker: PathTracker) -> Mask:
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again, starting at the smoothest displacement that explains it.
 
-    If the new root is across a fold, its twin on the same side as the rest position is used instead. Each
-    wire keeps whichever of its old and new solutions has the smoother displacement. If no new root is found,
-    the wire is not CONVERGED, even if it was previously.
+    If the new root is across a fold, its twin on the same side as the rest position is used instead. For each
+    wire, the smoother of the old and new solutions is kept. If no new root is found, the wire is not
+    CONVERGED, even if it was previously.
 
     Args:
         tracker: Tracker at the end of its path.

@@ -56,15 +56,15 @@ class Schedule(Protocol):
 class Uniform:
     """Schedule that solves ``steps`` evenly spaced samples, including the last.
 
-    The default tolerances and step limits are those of the paper (section 4).
+    The default tolerances and step limits are taken from the paper (section 4).
 
     Args:
         steps: Number of samples to solve; default: all. If there are fewer samples, all of them are solved.
         plain: If True, each sample starts at the last solution, as in the paper (Lahaye), and the positions
             found at the last sample are final. If False (default), each sample starts on the secant through
             the last two solutions, and wires without a plausible root at the last sample are solved again
-            from the smoothest displacement. In tests with presses of 50 %, the secant reduced the number of
-            unsolved wires from 7 of 197 to 0, and the number of evaluations per sample from 4 to 2.9.
+            from the smoothest displacement. In tests with presses of 50 % of h, the secant reduced the number
+            of unsolved wires from 7 of 197 to 0, and the number of evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance on both r and x (in pitches) at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum number of operator steps at each sample except the last.
@@ -112,7 +112,7 @@ class Periodic:
     restarts from rest and is solved with this cycle and tolerance. If no tolerance yields a cycle, every
     sample is solved with a tolerance of 1e-6.
 
-    The tolerances cannot be compared directly with those of the paper. The paper does not scale its
+    The tolerances are not directly comparable with the paper's tolerances. The paper does not scale its
     equations, and its ‖Jᵀr‖∞ is larger by a factor of F² than the value used here, with r = a F − 1 and
     lengths in pitches. The value of F depends on the unit of length, which the paper does not state.
 

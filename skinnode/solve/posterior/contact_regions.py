@@ -13,8 +13,8 @@ Only cells with an electrode are tested. The loads on cells beyond the outermost
 because a small load nearby and a large load farther away cause nearly the same displacement. Cells beyond the
 outermost electrodes are added to the adjacent contact.
 
-The thresholds have hysteresis, so that noise does not make contacts appear and disappear. To split a contact
-in two, or to merge two contacts, the load sum between the peaks must change by a third.
+The thresholds have hysteresis, so that noise does not make contacts appear and disappear. A contact splits in
+two, or two contacts merge, only if the load sum between the peaks changes by a third.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write those of ``cell`` and its neighbours that have an electrode into ``out``; return their number."""
+    """Write ``cell`` and its neighbours, if they have an electrode, into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:

@@ -32,11 +32,11 @@ HERTZ_SPREAD: Final = 2.5
 proportional to √(1 − r²/a²)."""
 PULLING: Final = 0.25
 """Minimum ratio of the sum of all loads of a contact to the sum of its pressing loads; below this ratio,
-pulling loads are left out. The half-space model needs pulling loads at the rim of a contact to reproduce the
-displacement of a supported layer. In measurements, the ratio was at most 0.15 on bonded layers of up to 8 mm,
-and at least 0.33 on a half-space."""
+tensile loads are ignored. The half-space model needs tensile loads at the rim of a contact to reproduce the
+displacement of a supported layer. The measured ratio was at most 0.15 on bonded layers of up to 8 mm, and at
+least 0.33 on a half-space."""
 PULLED_OFF: Final = 0.1
-"""Standard deviation, in cell widths, of the position of a contact's centre if its pulling loads are ignored.
+"""Standard deviation, in cell widths, of the position of a contact's centre if its tensile loads are ignored.
 The measured RMS error on layers of 2 to 8 mm was at most 0.11 cell widths."""
 BEYOND: Final = 1.0
 """Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
@@ -46,7 +46,7 @@ patch would reach 4.8 standard deviations."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadEstimate:
-    """Loads estimated from a frame. Their covariance is s² (D − s² D Wᵀ W D), with W = diag(weight) rows."""
+    """Loads estimated from a frame, with covariance s² (D − s² D Wᵀ W D), where W = diag(weight) · rows."""
 
     mean: Float
     """(Q, 3) mean loads, in units of the prior's loads."""
@@ -247,7 +247,7 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     ``std``. The variances are multiplied by ``doubt``, because the distribution of the load over the
     cells depends mainly on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work arrays.
 
-    Returns the cell closest to the centre, a bool that is True if pulling loads were left out, and the sum of
+    Returns the cell closest to the centre, a bool that is True if tensile loads were ignored, and the sum of
     the pressing loads in N.
     """
     size, every, pressing = 0, 0.0, 0.0

@@ -6,9 +6,9 @@ displace the electrodes according to the response G of an elastic half-space (Bo
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
-The scale s applies to the whole patch and is estimated from the data. Further cells lie beyond the outermost
-electrodes, because the skin can be pressed there as well. The term ε² I allows each electrode to deviate
-slightly from the half-space, independently of the others.
+The scale s applies to the whole patch and is estimated from the data. There are additional cells beyond the
+outermost electrodes, because the skin can be pressed there as well. The term ε² I allows each electrode to
+deviate slightly from the half-space, independently of the others.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Each frame passes through these steps:
 
 - Gate: select the wires whose resistances differ from those at rest by more than the noise. Only the
   equations of these wires are used.
-- Hold: if the last field explains the whole frame within the noise, keep it.
+- Hold: if the last field explains the whole frame to within the noise, keep it.
 - Track: starting from the last field, solve by chord or Gauss-Newton steps. If this fails, anneal from rest
   (``map_estimate``).
 - Adapt: estimate the prior scale, the expected load locations and, if requested, the noise.
@@ -207,9 +207,9 @@ class FrameEstimator:
         Args:
             readings: The frame.
             start: Time at which the update began, in s.
-            alone: The frame without the information of earlier frames, which determines the minimum prior
-                scale; the same as ``readings`` if None. Changes that a single frame does not show may not
-                have reached the filtered readings yet.
+            alone: The unfiltered frame, which determines the minimum prior scale; None if ``readings`` is
+                unfiltered. Changes hidden by the noise of a single frame may not have reached the filtered
+                readings yet.
         """
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
@@ -297,7 +297,7 @@ class FrameEstimator:
         return Readings(np.where(usable, a, self._problem.a_rest), noise, usable)
 
     def see_noise(self, ohm: Float, noise: Float, rounding_ohm: Float | None, valid: Mask | None) -> None:
-        """Pass a frame to the noise estimate; the arguments are those of :meth:`NoiseEstimate.see`."""
+        """Pass a frame to the noise estimate; see :meth:`NoiseEstimate.see` for the arguments."""
         if self.noise_estimate is not None and self.noise_estimate.see(ohm, noise, rounding_ohm, valid):
             self._seen = np.zeros_like(self._seen)  # the trusted field assumed a different noise
 
@@ -310,7 +310,7 @@ class FrameEstimator:
         return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
     def _is_quiet(self, observation: Observation) -> bool:
-        """Return whether the last field explains the frame within the noise.
+        """Return whether the last field explains the frame to within the noise.
 
         For wires that were used to compute the last field, the noise variance is doubled, because the field
         contains the noise of its own frame.
@@ -337,7 +337,7 @@ class FrameEstimator:
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # if no wire seems touched, use all wires to make sure
+        # if no wire seems touched, use all wires to be sure
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):

@@ -1,4 +1,4 @@
-"""Gating: χ² tests that find wires that moved, and wires whose resistances no deformation explains.
+"""Gating: χ² tests that find moved wires, and wires whose resistances no deformation explains.
 
 Each wire is tested in two ways: with the χ² of its residuals, and with the apparent movement of each
 coordinate. χ² alone can miss a movement of one electrode by 7 standard deviations.

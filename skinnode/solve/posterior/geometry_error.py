@@ -189,7 +189,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
 def _slopes(  # noqa: PLR0913 - a kernel: arrays by name
     square: float, outward: Float, placement: float, rows: Float, slopes: Float, jt: Float, effect: Float
 ) -> None:
-    """Convert the derivatives of one wire's F to those of its residuals, and write the effects of shifts."""
+    """Convert one wire's derivatives of F to derivatives of its residuals; write the effects of shifts."""
     f, bend, rest_bend, rims = rows[0], rows[1], rows[2], rows[3]
     for j in range(jt.shape[0]):
         row, before, along, t = jt[j], slopes[0, j], outward[j], COMMON + j % 3

@@ -114,7 +114,7 @@ class Hyperparameters:
     def with_discs(self, std: Float, core: Float) -> tuple[Float, Float]:
         """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
 
-        ``std`` also accounts for an additional touch of the whole patch that is too light to be detected. See
+        ``std`` also accounts for an additional touch of the whole patch that is too light to detect. See
         :mod:`skinnode.solve.posterior.local.disc_claim`.
         """
         if self.discs is None or not len(self.discs.discs) or not np.isfinite(std).all():
@@ -131,7 +131,7 @@ class Hyperparameters:
         return np.sqrt(std**2 + spread + light), np.sqrt(own + share * unseen + spread)
 
     def with_undetected(self, std: Float) -> Float:
-        """Return ``std`` (U, f), in pitches, including a local touch that remains undetected."""
+        """Return ``std`` (U, f), in pitches, increased to account for an undetected local touch."""
         if self.discs is None:
             return std
         variance = disc_claim.undetected_variance(self._estimator.information(), self._clearance)

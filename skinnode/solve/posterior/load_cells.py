@@ -85,7 +85,7 @@ def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     lower = layout.lower_m.reshape(-1, 3)
     up = (site - lower[_nearest(site, lower)]).mean(axis=(0, 1))
     wires, electrodes = site.shape[:2]
-    if min(wires, electrodes) == 1:  # a single row defines no plane; use that of the lower layer
+    if min(wires, electrodes) == 1:  # a single row defines no plane; use the plane of the lower layer
         flat = np.linalg.svd(lower - lower.mean(axis=0))[2][-1]
         up = flat * np.sign(flat @ up) if len(lower) > 2 and flat @ up != 0 else up
     up = up / np.linalg.norm(up)

@@ -1,10 +1,10 @@
-"""Prior of the loads on a patch, and of the displacement that they cause.
+"""Prior for the loads on a patch, and of the displacement that they cause.
 
-The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
-the prior expects loads mainly in the same places: in discs (:meth:`LoadPrior.set_discs`), or in the cells
-where they were found (:meth:`LoadPrior.localise`). The skin next to a contact is then estimated to move only
-as far as the contact's loads require. In tests, expecting loads where they were found reduced displacement
-errors by a factor of two to three.
+Initially, the prior expects equal loads over the whole patch, with a single scale s². Once loads have been
+found, the prior expects loads mainly in the same places: in discs (:meth:`LoadPrior.set_discs`), or in the
+cells where they were found (:meth:`LoadPrior.localise`). The skin next to a contact is then estimated to move
+only as far as the contact's loads require. In tests, expecting loads where they were found reduced
+displacement errors by a factor of two to three.
 """
 
 from __future__ import annotations

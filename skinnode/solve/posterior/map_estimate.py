@@ -4,9 +4,9 @@
   evaluations of F and its Jacobian.
 - A Gauss-Newton step computes new factors at the current field, and is followed by chord steps.
 - Annealing starts at rest and assumes a noise of 3 %, which it divides by four in each step until the actual
-  noise is reached. At high noise, the posterior has a single maximum, near that of the prior. Following this
-  maximum as the noise decreases usually leads to the correct maximum, even if a press indents the layer by
-  70 % of its thickness within one frame.
+  noise is reached. At high noise, the posterior has a single maximum, near the maximum of the prior.
+  Following this maximum as the noise decreases usually leads to the correct maximum, even if a press indents
+  the layer by 70 % of its thickness within one frame.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ ANNEAL_NOISE: Final = 0.03
 """Relative noise at the start of annealing. At this noise, a single Gauss-Newton step from rest almost
 reaches the maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Factor by which each annealing step reduces the noise. In tests with 80 presses of up to 70 %, annealing
-reached the correct maximum in all cases with a factor of 3, and in 79 cases with a factor of 5."""
+"""Factor by which each annealing step reduces the noise. In tests with 80 presses of up to 70 % of h,
+annealing reached the correct maximum in all cases with a factor of 3, and in 79 cases with a factor of 5."""
 SETTLED: Final = 0.02
 """Convergence tolerance of chord steps: RMS of the step, relative to the RMS standard deviation."""
 CHORDS: Final = 4
@@ -57,7 +57,7 @@ NEWTONS: Final = 12
 needed if full steps oscillate."""
 NEWTONS_MADE: Final = 40
 """Maximum number of factorisations in a solve with geometry errors. Such solves converge slowly, because the
-maximum of the posterior lies at the end of a curved ridge."""
+maximum of the posterior is at the end of a curved ridge."""
 FLAT: Final = 0.1
 """Convergence tolerance of a solve with geometry errors: decrease in −2 log posterior over :data:`FLAT_STEPS`
 factorisations."""
@@ -71,7 +71,7 @@ HALVINGS: Final = 6
 
 
 class MapEstimator:
-    """MAP estimator of one patch; holds the displacement, the nuisances and the last factors.
+    """MAP estimator of one patch; stores the displacement, the nuisances and the last factors.
 
     Each stream needs its own instance.
 
@@ -83,7 +83,7 @@ class MapEstimator:
         tolerances: Manufacturing tolerances of the patch.
 
     Attributes:
-        load_prior: Prior of the loads and of the displacement.
+        load_prior: Prior for the loads and of the displacement.
         moved: (U, 3N) displacement, in pitches; 0 for fixed coordinates.
         g: The p nuisances, followed by the geometry errors.
         std: (U, f) standard deviations from the last factors, in pitches.

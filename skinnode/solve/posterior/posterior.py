@@ -29,11 +29,11 @@ PLACED: Final = 2.0
 """Assumed error of a reading per pitch of placement error, as a fraction of the largest change in any
 reading."""
 RESOLVE: Final = 0.75
-"""Factor by which earlier frames must reduce the noise further for a frame to be solved again even if the
-last field explains it. The same applies if the noise increases by the reciprocal."""
+"""Ratio of the filtered noise to the filtered noise in the last solve, below which a frame is solved again
+even if the last field explains it. The reciprocal is the limit for an increase."""
 DITHERED: Final = 2.0
-"""Minimum ratio of a reading's noise to its quantization error for the mean of several readings to have a
-smaller quantization error than a single reading."""
+"""Minimum ratio of a reading's noise to its quantization error at which averaging reduces the quantization
+error."""
 
 
 class Posterior(FrameEstimator):
@@ -97,7 +97,7 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        With the option ``past``, the estimate also uses the readings of earlier frames.
+        With the ``past`` option, the estimate also uses the readings of earlier frames.
 
         No resistance value raises an exception. If a wire has no usable resistances, its displacement is
         estimated from its neighbours, and its standard deviation is larger. If no deformation explains the
@@ -134,7 +134,7 @@ class Posterior(FrameEstimator):
         if self._past is not None:
             factor = 1.0 if self.noise_estimate is None else self.noise_estimate.factor
             if factor != self._factor:
-                self._past.forget()  # its noise was not as assumed
+                self._past.forget()  # the filter assumed a different noise
             self._factor = factor
             self._past.next_frame()
 
@@ -146,7 +146,7 @@ class Posterior(FrameEstimator):
         return self.check.check(solve(), solve, start + self._seconds)
 
     def _with_past(self, readings: Readings, least: Float | None) -> Readings:
-        """Return the readings of a frame, estimated from this frame and those before it."""
+        """Return the readings of a frame, estimated from this frame and earlier frames."""
         if self._past is None:
             return readings
         found = self._past.filtered(readings, least)

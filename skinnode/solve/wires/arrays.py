@@ -34,7 +34,7 @@ RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 # Index of the relative noise in a code map
 NOISE: Final = 3
 
-# Actions for a wire in one call of the solver
+# Actions for a wire in one call to the solver
 LEAVE: Final = 0
 SOLVE: Final = 1
 PREDICT: Final = 2

@@ -54,7 +54,7 @@ def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
 
 @njit_part
 def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, tol_f: float) -> bool:  # noqa: PLR0913 - one wire of a call
-    """Hold wire ``u`` if its residual is within noise; return whether it is held.
+    """Hold wire ``u`` if its residual is within the noise; return whether it is held.
 
     For a held wire, also store the residual and the standard deviations.
     """
@@ -94,8 +94,8 @@ def _follow(  # noqa: PLR0913 - one wire of a call
 ) -> tuple[int, int, bool]:
     """Solve wire ``u`` with its old inverse, after a predicted step of size ``moved``.
 
-    Returns the number of evaluations of F, the number of steps, and whether a root was found for which the
-    old inverse can be kept.
+    Returns the number of evaluations of F, the number of steps, and whether a root was found and the old
+    inverse can be kept.
     """
     w: Any = solver.work
     evaluations, steps, first = follow(
@@ -200,8 +200,8 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for each upper wire selected by ``todo``.
 
     Args:
-        solver: Starting points and results. On entry, ``x`` and ``inverse`` are those of the last converged
-            solve.
+        solver: Starting points and results. On entry, ``x`` and ``inverse`` contain the results of the last
+            converged solve.
         options: Operator, tasks and tolerances.
         todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
         a: (U, K) scaled resistances. Values out of range are set to 1, and their weights to 0.

@@ -1,7 +1,7 @@
 """Compiled stages of a frame before and after the solve.
 
-``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. NumPy calls would take
-longer for these stages than the solve of a patch at rest.
+``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. With NumPy calls,
+these stages would take longer than solving a patch at rest.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ def _stale(weight: Float, before: Float) -> bool:
 def choose(frame: FrameArrays) -> None:
     """Choose the action for each wire: ``first`` if the wire has a usable inverse, otherwise SOLVE.
 
-    The pseudoinverse J⁺ of a tall system is unusable if a weight has since changed by more than ``STALE``.
+    The pseudoinverse J⁺ of a tall system is unusable if a weight has changed by more than a factor of
+    ``STALE`` since J⁺ was computed.
     """
     predictable, unknowns, todo = frame.predictable, frame.unknowns, frame.todo
     used, weight, first = frame.used, frame.weight_solved, frame.first

@@ -5,14 +5,14 @@ The variance of a coordinate is the sum of these parts:
 - n, due to noise and nuisances
 - b, which depends on the prior (:class:`skinnode.solve.posterior.load_prior.LoadPrior`)
 - d, due to the uncertainty of the discs
-- m, due to a slight touch of the whole patch that remains undetected
-- l, due to a local touch that remains undetected: a body on a thin bonded layer may move a single electrode
+- m, due to an undetected slight touch of the whole patch
+- l, due to an undetected local touch: a body on a thin bonded layer may move a single electrode
 
-The standard deviation is √(n + 2.5 b + d + m + l). That for the 95 % interval is √(n + s b + d), where the
+The standard deviation is √(n + 2.5 b + d + m + l). For the 95 % interval, it is √(n + s b + d), where the
 factor s depends on the coordinate and on the discs. Far from a contact, only the sum of its loads matters,
 and s is small, because the loads of real bodies are smoother than the independent loads in a disc. Under a
-contact, s is larger, because the displacement there depends on the support of the rubber, which the prior
-does not know.
+contact, s is larger, because the displacement there depends on how the rubber is supported, which the prior
+does not model.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from skinnode.solve.posterior.local.discs import RADIUS
 SHARE: Final = 0.5
 """Factor s of a coordinate that does not move and is well determined, for a single disc of the expected
 radius. The constants for s were fitted to the errors in 1,679 scenes of the families in ``skinnode bench
-accuracy --only families``, drawn with other seeds than those of the benchmark."""
+accuracy --only families``, drawn with seeds that the benchmark does not use."""
 SHARE_MOVED: Final = 3.4
 """Factor by which s is larger for the coordinate that moves farthest."""
 SHARE_RADIUS: Final = 1.4
 """Exponent of the strongest disc's radius in s."""
 SHARE_LEAST_RADIUS: Final = 0.9
 """Minimum radius in the computation of s, in cells. Without it, the 95 % intervals of small bodies on a thin
-bonded layer contain fewer errors: 80 instead of 81 % in the worst of 16 presses."""
+bonded layer contain fewer errors: 80 % instead of 81 % in the worst of 16 presses."""
 SHARE_DISC: Final = 1.35
 """Factor by which each further disc increases s. Several discs indicate loads that no single disc fits."""
 SHARE_UNKNOWN: Final = 0.28
@@ -47,8 +47,8 @@ LOCAL_MOST: Final = 0.1
 clearances."""
 LOCAL_NOTICED: Final = 2.0
 """Standard deviation of an undetected displacement of a single coordinate, in standard deviations of its
-best estimate with all other coordinates fixed. Bodies that moved a single electrode by up to 7 of the
-latter were not found, because their readings resembled those of a larger contact nearby."""
+best estimate with all other coordinates fixed. Bodies that moved a single electrode by up to 7 of these
+standard deviations were not found, because their readings resembled those of a larger contact nearby."""
 
 
 def prior_shares(displacement: Float, unknown: Float, discs: Float) -> Float:

@@ -185,8 +185,8 @@ class _Search:
     def places_of_next(self, discs: Float) -> Float:
         """Return the cells (P, 2) where another disc may be needed; none if no disc is needed.
 
-        One cell is that where a load on a half-space matches the remaining data best, the other that where a
-        load on a bonded layer does.
+        In one of these cells, a load on a half-space matches the remaining data best; in the other, a load on
+        a bonded layer does.
         """
         if len(discs) == MOST:
             return np.empty((0, 2))

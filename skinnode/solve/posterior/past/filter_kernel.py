@@ -3,9 +3,9 @@
 Each mode of the readings (:mod:`skinnode.solve.posterior.past.load_modes`) is the state of a scalar Kalman
 filter. The filters of all modes form a bank for each speed τ of the skin: from one frame to the next, a mode
 with the share λ changes by a random step of variance τ λ. The unit is the noise variance of a reading, so τ
-is the mean square of the change in all readings together. The last bank forgets the past: its state is the
-frame itself. Its likelihood is the mean over several large speeds, and over a change in all readings that no
-loads explain.
+is the mean square of the change in all readings together. The last bank forgets all earlier frames: its state
+is the current frame. Its likelihood is averaged over several large speeds and a change in all readings that
+no loads explain.
 
 The probabilities of the banks follow from the likelihoods of their predictions (Blom and Bar-Shalom, The
 interacting multiple model algorithm for systems with Markovian switching coefficients, 1988). Before each
@@ -25,20 +25,20 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 SPEEDS: Final = np.array([0.0, 0.03, 0.3])
-"""Speeds τ of the banks that use the past. With a bank for a speed of 3, a change of 7 standard deviations
-was followed only halfway in its first frame."""
+"""Speeds τ of the banks that use earlier frames. With an additional bank for a speed of 3, the filter
+followed a change of 7 standard deviations only halfway in the first frame."""
 JUMPS: Final = np.array([3.0, 30.0, 300.0, 3000.0, 300.0])
-"""Speeds τ of the bank that forgets the past."""
+"""Speeds τ of the bank that forgets all earlier frames."""
 UNEXPLAINED: Final = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
 """Variance of the change in each reading that no loads explain, for each of :data:`JUMPS`."""
 STAYS: Final = 0.9
 """Probability per frame that the skin keeps its speed."""
 JUMPS_CHANCE: Final = 0.03
-"""Probability per frame that the skin jumps. A second jump follows a jump with the probability ½."""
+"""Probability per frame that the skin jumps. After a jump, the probability of another jump is ½."""
 
 
 class FilterArrays(ArrayTable):
-    """Arrays of one patch's filter: S banks that use the past, and m readings in units of their noise."""
+    """Arrays of a patch's filter: S banks that use earlier frames; m readings in units of their noise."""
 
     modes: Annotated[NDArray[np.float64], "m m", READONLY]
     """Modes, as rows."""
@@ -52,7 +52,8 @@ class FilterArrays(ArrayTable):
     jumps: Annotated[NDArray[np.float64], "D", READONLY]
     unexplained: Annotated[NDArray[np.float64], "D", READONLY]
     switch: Annotated[NDArray[np.float64], "B B", READONLY]
-    """Probability of each bank (column) after each bank (row); B = S + 1, the last bank forgets the past."""
+    """Transition probability from each bank (row) to each bank (column). B = S + 1; the last bank forgets all
+    earlier frames."""
     frame: Annotated[NDArray[np.float64], "m"]
     """Changes in the readings from rest, ln(R₀/R) / σ."""
     state: Annotated[NDArray[np.float64], "B m"]
@@ -66,15 +67,15 @@ class FilterArrays(ArrayTable):
     next_variance: Annotated[NDArray[np.float64], "B m"]
     next_chance: Annotated[NDArray[np.float64], "B"]
     modal: Annotated[NDArray[np.float64], "m"]
-    """Work array: the frame along the modes."""
+    """Work array: components of the frame along the modes."""
     expected: Annotated[NDArray[np.float64], "B"]
     """Work array: probability of each bank before the frame is considered."""
     mixture: Annotated[NDArray[np.float64], "B B"]
-    """Work array: share of each bank (row) in the start of each bank (column)."""
+    """Work array: weight of each bank (row) in the initial state of each bank (column)."""
     start_of: Annotated[NDArray[np.float64], "B"]
-    """Work array: share of each bank in the start of one bank."""
+    """Work array: weight of each bank in the initial state of one bank."""
     filtered: Annotated[NDArray[np.float64], "m"]
-    """Result: changes in the readings, filtered."""
+    """Result: filtered changes in the readings."""
     noise: Annotated[NDArray[np.float64], "m"]
     """Result: variance of the filtered changes, in units of the frame's noise variance."""
 
@@ -83,10 +84,10 @@ arrays_of = reader(FilterArrays)
 
 
 def switching(speeds: int) -> Float:
-    """Return the probabilities (S + 1, S + 1) of each bank (column) after each bank (row).
+    """Return the transition probabilities (S + 1, S + 1) from each bank (row) to each bank (column).
 
     Args:
-        speeds: Number S of banks that use the past.
+        speeds: Number S of banks that use earlier frames.
     """
     switch = np.full((speeds + 1, speeds + 1), (1.0 - STAYS - JUMPS_CHANCE) / max(speeds - 1, 1))
     np.fill_diagonal(switch, STAYS)
@@ -98,7 +99,7 @@ def switching(speeds: int) -> Float:
 
 @njit
 def start(table: NDArray[np.int64]) -> None:
-    """Start the filter with a frame.
+    """Initialise the filter with a frame.
 
     Args:
         table: Table of :class:`FilterArrays`.
@@ -119,7 +120,7 @@ def start(table: NDArray[np.int64]) -> None:
 
 @njit_part
 def _mix(switch: Float, chance: Float, mixture: Float, expected: Float) -> None:
-    """Write each bank's probability before the frame, and the shares of all banks in its start."""
+    """Write each bank's probability before the frame, and the weights of all banks in its initial state."""
     banks = chance.size
     for j in range(banks):
         total = 0.0
@@ -147,7 +148,7 @@ def _merge(share: Float, means: Float, variances: Float, i: int) -> tuple[float,
 def _update(  # noqa: PLR0913 - a kernel: arrays by name
     frame: Float, share: Float, speed: float, least: float, mean: Float, variance: Float
 ) -> float:
-    """Update a bank that uses the past with a frame; return its log likelihood."""
+    """Update a bank that uses earlier frames; return the log likelihood of the frame."""
     square, log_det = 0.0, 0.0
     for i in range(frame.size):
         ahead = variance[i] + speed * share[i]
@@ -164,7 +165,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 def _forget(  # noqa: PLR0913 - a kernel: arrays by name
     frame: Float, share: Float, jumps: Float, unexplained: Float, mean: Float, variance: Float
 ) -> float:
-    """Replace the state of the last bank by a frame; return its log likelihood."""
+    """Replace the state of the last bank with the frame; return the log likelihood of the frame."""
     total, top = 0.0, -np.inf
     for d in range(jumps.size):
         square, log_det = 0.0, 0.0
@@ -187,7 +188,7 @@ def _forget(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit_part
 def _to_chances(logs: Float) -> None:
-    """Replace log probabilities by probabilities whose sum is 1."""
+    """Convert log probabilities to probabilities that sum to 1."""
     top, total = -np.inf, 0.0
     for j in range(logs.size):
         top = max(top, logs[j])
@@ -200,7 +201,7 @@ def _to_chances(logs: Float) -> None:
 
 @njit_part
 def _add(mean: float, variance: float, mode: Float, filtered: Float, noise: Float) -> None:
-    """Add a mode to the filtered readings and to their noise."""
+    """Add the contribution of a mode to the filtered readings and to their noise."""
     for k in range(mode.size):
         filtered[k] += mean * mode[k]
         noise[k] += variance * mode[k] * mode[k]
@@ -208,7 +209,7 @@ def _add(mean: float, variance: float, mode: Float, filtered: Float, noise: Floa
 
 @njit
 def filter_frame(table: NDArray[np.int64], least: float) -> float:
-    """Filter a frame; return the probability that the skin jumped, so that the past does not apply.
+    """Filter a frame; return the probability that the skin jumped, which invalidates earlier frames.
 
     Args:
         table: Table of :class:`FilterArrays`.

@@ -1,12 +1,11 @@
-"""Filter over the frames of one patch: replaces a frame's readings by estimates from several frames.
+"""Filter over the frames of one patch: replaces a frame's readings with estimates from several frames.
 
 The filter works on the logarithms of the readings, before the posterior solves them. It returns readings with
-less noise, which the posterior solves like those of a single frame. A change in the loads that the noise
-cannot explain makes the filter forget the past in the same frame; the frame is then solved as it is.
+less noise, which the posterior solves like those of a single frame. If noise cannot explain a change in the
+readings, the filter forgets all earlier frames immediately, and the frame is solved unfiltered.
 
-The state before a frame is kept until the next frame. If the data check finds wrong readings, it solves the
-frame again without them, and the filter repeats the frame without them, too. Wrong readings that have been
-found therefore do not affect later frames.
+The state before a frame is kept until the next frame. If the data check finds wrong readings, both the filter
+and the solve are repeated without them. Detected wrong readings therefore do not affect later frames.
 """
 
 from __future__ import annotations
@@ -38,17 +37,18 @@ covers would make correct readings contradict each other."""
 MOST_FRAMES: Final = 64.0
 """Maximum number of frames averaged."""
 ENOUGH: Final = 0.5
-"""Minimum fraction of usable readings. With fewer, the filter forgets the past."""
+"""Minimum fraction of usable readings. With fewer, the filter forgets all earlier frames."""
 JUMPED: Final = 0.5
-"""Probability of a jump above which a frame is solved as it is."""
+"""Probability of a jump above which a frame is solved unfiltered."""
 
 
 SURPRISE: Final = 5.0
-"""Change along one mode or of one coordinate, in standard deviations, above which the filter forgets the
-past. The banks expect changes in many cells at once. Without this test, slow movements of a single electrode
-under a small body went unnoticed, and errors reached 10 standard deviations."""
+"""Change along one mode or of one coordinate, in standard deviations, above which the filter forgets all
+earlier frames. The banks expect changes in many cells at once. Without this test, slow movements of a single
+electrode under a small body went unnoticed, and errors reached 10 standard deviations."""
 RECENT: Final = 0.25
-"""Weight of the last frame in the mean change that is tested besides the change of the last frame."""
+"""Weight of the last frame in the running mean of the changes. Both this mean and the last change are
+tested."""
 
 
 class FrameFilter:
@@ -107,7 +107,7 @@ class FrameFilter:
         self._shift: Float | None = None  # readings of the last frame that were not usable before it
 
     def next_frame(self) -> None:
-        """Accept the last frame; the frames filtered from now on follow it."""
+        """Accept the last frame, and advance the filter to the next frame."""
         its = self._arrays
         its.state[:], its.variance[:], its.chance[:] = its.next_state, its.next_variance, its.next_chance
         self._spread = min(float(its.noise.mean()), 1.0)
@@ -118,14 +118,14 @@ class FrameFilter:
         self._shift = None
 
     def filtered(self, readings: Readings, least: Float | None = None) -> Readings:
-        """Return the readings of a frame, estimated from this frame and those before it.
+        """Return the readings of a frame, estimated from this frame and earlier frames.
 
         If the method is called again before :meth:`next_frame`, the new readings replace those of the frame.
 
         Args:
             readings: The frame. Readings that are not usable are ignored and stay unusable. A reading is
-                returned as it is if it was not usable in the last frame, or if it repeats its last value
-                exactly: a frozen converter also repeats its noise, which averaging then does not reduce.
+                returned unchanged if it was not usable in the last frame, or if it repeats its last value
+                exactly, because averaging does not reduce the noise of a frozen converter.
             least: (U, K) relative errors that are the same in all frames, such as the quantization error of
                 readings with little noise; None if there are none.
         """
@@ -163,7 +163,7 @@ class FrameFilter:
         return Readings(np.where(past, a, readings.a), np.where(past, noise, readings.noise), used)
 
     def _advance(self, least: float) -> bool:
-        """Filter the frame; return whether the skin jumped, so that the frame is used alone.
+        """Filter the frame; return whether the skin jumped, in which case the frame is used alone.
 
         Args:
             least: Minimum variance of a filtered mode, in units of the noise variance.
@@ -188,7 +188,7 @@ class FrameFilter:
         return bool(max(one, recent * (2.0 - RECENT) / RECENT) > SURPRISE**2)
 
     def _rescale(self, ratio: float) -> None:
-        """Express the state before the frame in units of another noise; ``ratio`` is old noise / new."""
+        """Convert the state before the frame to units of a new noise; ``ratio`` is old noise / new noise."""
         if ratio == 1.0:
             return
         its = self._arrays
@@ -200,7 +200,7 @@ class FrameFilter:
         self._sigma /= ratio
 
     def _restart(self, shift: Float) -> None:
-        """Take readings that were not usable before from the last frame alone.
+        """Use only the last frame for readings that were not usable before.
 
         Args:
             shift: (m,) differences between these readings and the filtered changes; 0 for other readings.

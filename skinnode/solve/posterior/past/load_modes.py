@@ -1,4 +1,4 @@
-"""Modes of a layout: the directions in which changes in the loads change the readings.
+"""Modes of a layout: the directions in which the readings change when the loads change.
 
 The modes are the eigenvectors of J C Jᵀ (:mod:`skinnode.solve.checks.reading_model`). If the loads change at
 random, the readings' changes along different modes are independent.
@@ -19,7 +19,7 @@ LEAST_SHARE: Final = 1e-3
 """Minimum variance of a mode, relative to the largest. Large displacements change the readings along all
 modes, because the readings are not linear in the displacement."""
 LARGEST: Final = 16
-"""Number of modes that are tested for a change one by one."""
+"""Number of modes that are individually tested for a change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,13 @@ class LoadModes:
     sum would be 1."""
     weight: Float
     """(m,) weight of each mode in the noise of the filtered readings: the square root of the share. The
-    solver assumes that the errors of the readings are independent, but the filter uses fewer frames for the
-    modes of the loads. The noise is therefore stated for these modes."""
+    solver assumes that the errors of the readings are independent, but the filter averages fewer frames along
+    the modes with a large share. The stated noise is therefore the noise of these modes."""
     total: Float
     """(m,) Σ weight mode² of each reading."""
     coordinates_t: Float
-    """(U, 3N, K) changes in each wire's readings caused by a movement of a single coordinate, scaled to the
-    norm 1."""
+    """(U, 3N, K) changes in each wire's readings caused by a movement of a single coordinate, scaled to unit
+    norm."""
 
     @classmethod
     def of(cls, layout: PatchLayout) -> LoadModes:
@@ -49,8 +49,8 @@ class LoadModes:
     def largest(self, changes: Float) -> Float:
         """Return the largest component of each column of ``changes`` along a mode or a coordinate.
 
-        Only the largest modes are considered. For independent changes of variance 1, each component has the
-        variance 1.
+        Only the largest modes are considered. For independent changes of variance 1, each component has a
+        variance of 1.
 
         Args:
             changes: (m, C) changes in the readings.

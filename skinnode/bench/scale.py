@@ -56,7 +56,7 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
     """Measure CPU time as a function of skin area and of the number of touched patches.
 
     Args:
-        patches: Numbers of patches to measure; in each hand, one patch is touched.
+        patches: Patch counts to measure; one patch of each hand is touched.
         scans: Number of scans per measurement; fewer for large hands (:data:`MOST_FIELDS`), and at least
             :data:`CHANGED_SCANS` if only changed chunks are sent.
 

@@ -343,7 +343,7 @@ def singles() -> list[Fault]:
         Fault("patch frozen while held", sent=_freeze(lambda signal: signal.pressed.start + 5)),
         Fault("upper wire frozen", sent=_freeze_wire(upper), local=True),
         Fault("lower wire frozen", sent=_freeze_wire(lower), local=True),
-        Fault("crossing stuck at a reading", sent=_stick(constant=False), local=True),
+        Fault("crossing frozen at last reading", sent=_stick(constant=False), local=True),
         Fault("crossing stuck at a constant", sent=_stick(constant=True), local=True),
         Fault("bit flipped once", sent=_flip_once, local=True),
         Fault("bit flipped for ever", sent=_flip_for_ever, local=True),

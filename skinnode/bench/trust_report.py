@@ -31,10 +31,10 @@ def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> lis
         if not by_section[section]:
             continue
         share = _sum(by_section[section], "beyond") / max(1.0, _sum(by_section[section], "coordinates"))
-        found.append(_must(f"trusted coordinates beyond 5 deviations, {what}", share, BEYOND))
+        found.append(_must(f"trusted coordinates beyond 5σ, {what}", share, BEYOND))
         if section == "single":
             missed = [row for row in by_section[section] if row["share_beyond"] > BEYOND]
-            found.append(_must("faults with over 1 in 1000 coordinates beyond 5 deviations", len(missed), 0))
+            found.append(_must("faults with over 1 in 1000 coordinates beyond 5σ", len(missed), 0))
     if by_section["healthy"]:
         quiet = {setting.name for setting in settings if setting.noise <= 1e-4}
         cells = [
@@ -66,7 +66,7 @@ def part_verdicts(figures: dict[str, Any]) -> list[dict[str, Any]]:
         found.append(_must("earlier failures that persist", missed, 0))
     if "road" in figures:
         share = _sum(figures["road"], "beyond") / max(1.0, _sum(figures["road"], "coordinates"))
-        found.append(_must("trusted coordinates beyond 5 deviations, over the bus", share, BEYOND))
+        found.append(_must("trusted coordinates beyond 5σ, over a bus", share, BEYOND))
     return found
 
 

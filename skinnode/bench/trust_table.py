@@ -313,7 +313,7 @@ LINES: Final = (
         "one crossing stuck",
         "21 of 36 fields trusted, all wrong by more than 6 deviations",
         _both(
-            ("at a reading", _with_fault("crossing stuck at a reading", FINE)),
+            ("at the last reading", _with_fault("crossing frozen at last reading", FINE)),
             ("at a constant", _with_fault("crossing stuck at a constant", FINE)),
         ),
     ),

@@ -96,7 +96,7 @@ def _draw(source: Path, target: Path, hand: HandConfig | None) -> Conversion:
 
     require_viewer("target")
     if target.exists():
-        raise ConfigError("target", str(target), "a new file; this one exists and is not overwritten")
+        raise ConfigError("target", str(target), "a new file; this one already exists and is not overwritten")
     if not target.parent.is_dir():
         raise ConfigError("target", str(target), "a file in an existing folder")
     create_binary(target).close()  # fails if another command has created the file

@@ -1,4 +1,4 @@
-"""Monitor a running host's health and its patches' touches, and publish changes as events."""
+"""Monitor the health of a running host and the touches on its patches, and publish changes as events."""
 
 from __future__ import annotations
 

@@ -94,5 +94,5 @@ def _require_new(jobs: Sequence[Job], parts: PartFiles) -> None:
     for job in jobs:
         target = job.write.target
         if target.exists() and not job.write.finished(parts):
-            allowed = "a new file; this one exists and is not overwritten"
+            allowed = "a new file; this one already exists and is not overwritten"
             raise ConfigError("--output", str(target), allowed)

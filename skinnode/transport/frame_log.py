@@ -160,7 +160,7 @@ def _errors_of(path: Path) -> Iterator[None]:
         yield
     except FileExistsError:
         raise ConfigError(
-            "recording", str(path), "a new file; this one exists and is not overwritten"
+            "recording", str(path), "a new file; this one already exists and is not overwritten"
         ) from None
     except OSError as error:
         raise ConfigError("recording", str(path), f"a file that can be created ({error.strerror})") from None

@@ -100,7 +100,7 @@ def require_new_file(path: Path) -> None:
             pass
         path.unlink()
     except FileExistsError:
-        raise ConfigError("--save", str(path), "a new file; this one exists") from None
+        raise ConfigError("--save", str(path), "a new file; this one already exists") from None
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise ConfigError("--save", str(path), f"a file that can be created ({why})") from None

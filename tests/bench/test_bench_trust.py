@@ -281,17 +281,17 @@ def row(section: str, name: str, **changes: float) -> dict:
 @pytest.mark.parametrize(
     ("changed", "missed"),
     [
-        (row("healthy", "sphere", beyond=2), "trusted coordinates beyond 5 deviations, no fault"),
+        (row("healthy", "sphere", beyond=2), "trusted coordinates beyond 5σ, no fault"),
         (row("healthy", "sphere", trusted=98), "trusted fields without a fault, noise up to 1e-4"),
         (
             row("single", "upper wire open", beyond=2),
-            "faults with over 1 in 1000 coordinates beyond 5 deviations",
+            "faults with over 1 in 1000 coordinates beyond 5σ",
         ),
         (
             row("single", "upper wire open", after_trusted=47),
             "trusted fields with one fault, after its detection",
         ),
-        (row("pair", "a pair", beyond=2), "trusted coordinates beyond 5 deviations, two faults"),
+        (row("pair", "a pair", beyond=2), "trusted coordinates beyond 5σ, two faults"),
         (row("hours", "1e-05", frames=360_000, false_names=1), "false alarms per patch-hour"),
     ],
 )
@@ -336,7 +336,7 @@ def test_a_healthy_press_is_solved_and_reported(tmp_path) -> None:
     assert (row["frames"], row["trusted"], row["beyond"]) == (112, 112, 0)
     assert 1.0 < row["worst"] <= 5.0
     assert set(row["settings"]) == {"staggered h=0.5, 1e-5", "staggered h=0.5, 1e-4"}
-    assert "trusted coordinates beyond 5 deviations, no fault" in result.output
+    assert "trusted coordinates beyond 5σ, no fault" in result.output
     assert "NOT" not in result.output
 
 

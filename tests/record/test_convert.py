@@ -204,7 +204,7 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(recorded: Path,
         ),
         (recorded, "y.txt", "allowed: a file ending in .log, .blf, .asc, .mcap, .parquet, .npz or .rrd"),
         (tmp_path / "x.npz", "y.rrd", "allowed: a file ending in .parquet or .npz; a field table contains"),
-        (recorded, "x.npz", "allowed: a new file; this one exists and is not overwritten"),
+        (recorded, "x.npz", "allowed: a new file; this one already exists and is not overwritten"),
         (recorded, "no/y.npz", "allowed: a file in an existing folder"),
         (tmp_path / "other.npz", "y.parquet", "allowed: an NPZ file of fields written by skinnode convert"),
         (

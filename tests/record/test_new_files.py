@@ -143,7 +143,7 @@ def test_a_conversion_never_deletes_the_file_of_another_command(
         return opened(path)
 
     monkeypatch.setattr(convert, "open_recording", while_another_command_creates_the_target)
-    with pytest.raises(ConfigError, match="this one exists and is not overwritten"):
+    with pytest.raises(ConfigError, match="this one already exists and is not overwritten"):
         convert.convert(source, target)
     assert [path for path in tmp_path.iterdir() if path.is_file()] == [target]
     assert target.read_bytes() == b"the other command's"

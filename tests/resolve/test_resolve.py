@@ -446,7 +446,7 @@ def test_files_that_cannot_be_used_are_one_line(recording: Path, tmp_path: Path)
     assert not out.exists()
     out.mkdir()
     (out / "run.parquet").write_text("mine")
-    assert "allowed: a new file; this one exists" in refusal(recording, "-o", out)
+    assert "allowed: a new file; this one already exists" in refusal(recording, "-o", out)
     assert (out / "run.parquet").read_text() == "mine"
 
 

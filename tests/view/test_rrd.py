@@ -199,7 +199,7 @@ def test_the_command_converts_a_recording(recording: Path, tmp_path: Path, sdk: 
     again = view("--replay", str(recording), "--save", str(path))
     assert (again.returncode, again.stdout) == (2, "")
     assert again.stderr.count("\n") == 1
-    assert "allowed: a new file; this one exists" in again.stderr
+    assert "allowed: a new file; this one already exists" in again.stderr
     assert len(Rows(path).of) == len(rows.of)  # and is as it was
 
 
@@ -217,7 +217,7 @@ def test_convert_draws_as_view_does_unless_told_otherwise(recording: Path, tmp_p
         path = f"/skin/hand/{patch}/surface"
         assert found.scans(path) == wanted.scans(path) != {}
     again = subprocess.run(arguments, capture_output=True, text=True, timeout=60.0, check=False)
-    assert (again.returncode, "allowed: a new file; this one exists" in again.stderr) == (2, True)
+    assert (again.returncode, "allowed: a new file; this one already exists" in again.stderr) == (2, True)
 
 
 def test_a_damaged_recording_is_converted_as_far_as_it_goes(

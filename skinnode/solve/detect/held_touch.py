@@ -118,7 +118,7 @@ def _energy(test: TouchTest, features: Float) -> float:
 
 
 def creep_of(peak: float, since_s: float) -> float:
-    """Return the energy that may remain ``since_s`` after the end of a touch with the peak energy ``peak``.
+    """Return the energy that may remain ``since_s`` seconds after a touch whose peak energy was ``peak``.
 
     Creep slows down. During the first :data:`RESIDUE_S`, a fraction :data:`RESIDUE` of the amplitude may
     remain; afterwards, this fraction decreases in inverse proportion to time.

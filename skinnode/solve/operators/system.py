@@ -81,8 +81,9 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
 
     Returns:
         The best iterate, with its status and kind. CONVERGED means a root or, with more equations than
-        unknowns, an isolated minimum of ‖r‖; ``kind`` says which. ILL_CONDITIONED means a point that the
-        equations do not determine, or a minimum of a square system with r ≠ 0, where J is singular.
+        unknowns, an isolated minimum of ‖r‖; ``kind`` says which. ILL_CONDITIONED means that the
+        equations do not determine the point, or that J is singular at a minimum of a square system with
+        r ≠ 0.
         INVALID_START means that there are fewer equations than unknowns, or that the residual or the Jacobian
         is not finite at ``x0``. The test for a minimum evaluates at least 2 n Jacobians, which are included
         in ``stats``.

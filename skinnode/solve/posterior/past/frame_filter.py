@@ -30,7 +30,7 @@ from skinnode.solve.posterior.past.load_modes import LoadModes
 
 NOISY: Final = 0.9e-4
 """Minimum relative noise of the readings (RMS) for the filter to be used. It is slightly below 1e-4, so that
-a noise of 1e-4 is filtered even if the noise estimate is a little lower."""
+a noise level of 1e-4 is filtered even if its estimate is a little lower."""
 LEAST_NOISE: Final = 2.5e-5
 """Minimum noise of the filtered readings. With less noise, errors of the forward model that the stated noise
 covers would make correct readings contradict each other."""

@@ -102,10 +102,10 @@ def _check(source: Path, target: Path, hand: HandConfig | None) -> None:
     taken = [target]
     if target.suffix in WRITABLE and not _share_journal(source, target):
         taken.append(new_journal_of(target))
-    allowed = "a new file; this one already exists and is not overwritten"
+    new_file = "a new file; this one already exists and is not overwritten"
     for path in taken:
         if path.exists():
-            raise ConfigError("target", str(path), allowed)
+            raise ConfigError("target", str(path), new_file)
     if not target.parent.is_dir():
         raise ConfigError("target", str(target), "a file in an existing folder")
 

@@ -138,8 +138,14 @@ def skinnode_version() -> str:
             "host hand.toml --seconds -1",
             "skinnode host: --seconds: got '-1', allowed: a non-negative number of seconds",
         ),
-        ("node --source simulated --seconds inf", "skinnode node: --seconds: got 'inf', allowed: a number"),
-        ("record hand.toml x --seconds nan", "skinnode record: --seconds: got 'nan', allowed: a number"),
+        (
+            "node --source simulated --seconds inf",
+            "skinnode node: --seconds: got 'inf', allowed: a non-negative number",
+        ),
+        (
+            "record hand.toml x --seconds nan",
+            "skinnode record: --seconds: got 'nan', allowed: a non-negative number",
+        ),
         ("record x.toml -o . --format asc", "skinnode record: --format: got 'asc', allowed: log or blf"),
         ("conformance --only ,", "--only: got ',', allowed: an area"),
         ("conformance --node-id 4 --eds no.eds", "--eds: got 'no.eds', allowed: a file that can be read"),

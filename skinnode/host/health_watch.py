@@ -28,7 +28,7 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, mapped to the singular and any irregular plural for event texts."""
+"""Counters of :class:`PatchHealth`, mapped to the noun in event texts (singular, irregular plural)."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -40,7 +40,7 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, mapped to the singular and any irregular plural for event texts."""
+"""Counters of :class:`BusHealth`, mapped to the noun in event texts (singular, irregular plural)."""
 
 
 def _monotonic_ns() -> int:

@@ -20,7 +20,7 @@ def restore_time_us(low_us: int, expected_us: int) -> int:
     """Return the device time (µs) with the given low bits that is nearest to the expected time.
 
     Args:
-        low_us: Device time (µs) without its upper bits, from a summary with a check.
+        low_us: Lower bits of the device time (µs), from a summary that contains a checksum.
         expected_us: Expected device time, in µs.
     """
     return expected_us + (low_us - expected_us + TIME_WRAP_US // 2) % TIME_WRAP_US - TIME_WRAP_US // 2
@@ -46,7 +46,7 @@ class DeviceTimeTracker:
         seconds of its scan.
 
         Args:
-            low_us: Device time (µs) without its upper bits, from a summary with a check.
+            low_us: Lower bits of the device time (µs), from a summary that contains a checksum.
             t_ns: Arrival time of the summary on the host's monotonic clock, in ns.
         """
         expected_us = self._time_us + (t_ns - self._t_time_ns) // 1000

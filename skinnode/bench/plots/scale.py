@@ -41,7 +41,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     memory.set_ylabel("memory of the process, MB")
     memory.set_ylim(bottom=0.0)
     contact.set_xlabel(f"touched patches of {figures['contact'][0]['patches']}")
-    area.set_ylabel("CPU time per patch and scan, ms")
+    area.set_ylabel("CPU time per patch per scan (ms)")
     area.set_ylim(bottom=0.0)
     area.legend(fontsize="small")
     machine = ", ".join(f"{key} {value}".strip() for key, value in figures["machine"].items())

@@ -1,4 +1,4 @@
-"""Codes of operators and statuses in compiled code, and tolerances for rounding errors."""
+"""Operator and status codes of the compiled code, and tolerances for rounding errors."""
 
 from __future__ import annotations
 

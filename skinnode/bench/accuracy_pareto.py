@@ -1,9 +1,10 @@
 """Compares the methods of solving a frame by their error and their CPU time: a Pareto front for each noise.
 
-The streams are those of ``skinnode bench accuracy --only past``: seven families of loads, half of the rigid
-bodies on a bonded layer of the simulator. Each method solves the same readings. The frames in which a body is
-held and those in which it moves are counted separately, because a held field costs hardly anything, and only
-a held body gains much from earlier frames.
+In each stream, a body is pressed, held still, slides and is slowly released. The truth comes from the
+families of ``skinnode bench accuracy --only families``; half of the rigid bodies press on a bonded layer of
+the simulator. Each method solves the same readings. The frames in which a body is held and those in which it
+moves are counted separately, because a held field costs little, and a held body gains most from earlier
+frames.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench import accuracy_past
-from skinnode.bench.accuracy_past import LAYOUT, Sum
+from skinnode.bench.accuracy_past import LAYOUT, Phase, Sum
 from skinnode.bench.case import preset
 from skinnode.bench.family_scenes import FAMILIES
 from skinnode.bench.truth import Skin
@@ -32,12 +33,15 @@ METHODS: Final[dict[str, dict[str, str] | None]] = {
 }
 """Options of the posterior for each method; None for the exact inverse."""
 SIGMAS: Final = (1e-5, 1e-4, 1e-3)
-MOTIONS: Final = {
-    "held": ("hold", "hold, frame 28"),
-    "moving": ("slow press", "slide", "creep", "slow release"),
-}
-"""Phases of the streams (:data:`skinnode.bench.accuracy_past.PHASES`) in which a body is held or moves. The
-frames of an onset and of a sudden release are not counted."""
+PHASES: Final = (
+    Phase("rest", 2, 0.0),
+    Phase("onset", 1, 0.85),
+    Phase("hold", 27, 0.85),
+    Phase("slide", 12, 0.85, 1.0),
+    Phase("slow release", 15, 0.3, 1.0),
+)
+MOTIONS: Final = {"held": ("hold",), "moving": ("slide", "slow release")}
+"""Phases in which a body is held or moves. Frames at rest and the first frame of a touch are not counted."""
 COVERAGE_LEAST: Final = 0.92
 
 
@@ -63,7 +67,7 @@ def run(scenes: int, echo: Callable[[str], object] = lambda _: None) -> dict[str
     for number in range(scenes):
         for index, family in enumerate(FAMILIES):
             echo(f"scene {number + 1} of {scenes}: {family}")
-            frames = accuracy_past.truth(family, skin, number)
+            frames = accuracy_past.truth(family, skin, number + index, PHASES)
             true_ohm = [skin.resistance_ohm(moved) for _, moved in frames]
             for (sigma, method), solver in solvers.items():
                 rng = np.random.default_rng([number, index, 2])
@@ -123,10 +127,16 @@ def pooled(figures: dict[str, Any], sigma: float, motion: str) -> list[dict[str,
     ]
 
 
-def never_best(figures: dict[str, Any]) -> list[str]:
-    """Return the methods that are on no Pareto front of all families together."""
-    best = {row["method"] for row in figures["pareto"] if row["family"] == "all" and row["front"]}
-    return [method for method in METHODS if method not in best]
+def outdone(figures: dict[str, Any]) -> dict[str, list[float]]:
+    """Return the noise levels at which a method is on no Pareto front, for each such method."""
+    found: dict[str, list[float]] = {}
+    for sigma in sigmas(figures):
+        rows = [row for motion in MOTIONS for row in pooled(figures, sigma, motion)]
+        best = {row["method"] for row in rows if row["front"]}
+        for method in dict.fromkeys(row["method"] for row in rows):
+            if method not in best:
+                found.setdefault(method, []).append(sigma)
+    return found
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
@@ -153,7 +163,7 @@ _COLUMNS: Final = (
 
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
-    """Print the table for all families together, and which methods other methods outdo."""
+    """Print the table for all families together, and the methods that are on no Pareto front."""
     layout = f"{LAYOUT[0]} h={LAYOUT[1]:g}"
     echo(f"\nCPU time per frame and median error of each method, {layout}, all families; *: Pareto front")
     echo(f"  {'noise, motion, method':32}{''.join(title.rjust(width) for _, title, width, _ in _COLUMNS)}")
@@ -166,8 +176,9 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
                 )
                 mark = "*" if row["front"] else " "
                 echo(f"{mark} {f'{sigma:.0e} {motion:7} ' + row['method']:32}{cells}")
-    for method in never_best(figures):
-        echo(f"{method}: at every noise, another method has a smaller error in less time")
+    for method, noises in outdone(figures).items():
+        levels = ", ".join(f"{sigma:.0e}" for sigma in noises)
+        echo(f"  {method}: other methods have smaller errors in less time at a noise of {levels}")
 
 
 def _unknown(value: float | None) -> bool:

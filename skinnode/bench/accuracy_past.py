@@ -129,13 +129,16 @@ class Sum:
         }
 
 
-def truth(family: str, skin: Skin, number: int) -> list[tuple[str, Float]]:
+def truth(
+    family: str, skin: Skin, number: int, phases: tuple[Phase, ...] = PHASES
+) -> list[tuple[str, Float]]:
     """Return the phase and the true displacement (U, N, 3), in metres, of each frame of a scene.
 
     Args:
         family: One of :data:`FAMILIES`.
         skin: Patch to press.
         number: Number of the scene. In scenes with odd numbers, rigid bodies press on a bonded layer.
+        phases: Parts of the stream.
     """
     seed = [number, FAMILIES.index(family)]
     rng = np.random.default_rng([*seed, 1])
@@ -155,7 +158,7 @@ def truth(family: str, skin: Skin, number: int) -> list[tuple[str, Float]]:
         return found
 
     frames, share, shift = [], 0.0, 0.0
-    for phase in PHASES:
+    for phase in phases:
         way = np.linspace(0.0, 1.0, STEPS + 1)
         still = phase.frames == 1 or (phase.share, phase.shift) == (share, shift)
         knots = [

@@ -16,6 +16,8 @@ MARKS: Final = {
     "discs, past": ("discs, earlier frames", "tab:blue", "v"),
 }
 """Label, colour and marker of each method."""
+SIZES: Final = {method: 55 if "past" in method else 140 for method in METHODS}
+"""Size of each method's mark: if earlier frames change nothing, both marks of a prior remain visible."""
 TITLES: Final = {"held": "body held still", "moving": "body moving"}
 ASKED: Final = (0.92, 0.98)
 """Range of the coverage that is shaded."""
@@ -64,10 +66,12 @@ def _errors(axes: Any, figures: dict[str, Any], sigma: float, motion: str) -> No
         )  # fmt: skip
         (every,) = (row for row in rows if row["method"] == method and row["family"] == "all")
         axes.scatter(
-            every["ms"], 100.0 * every["error"], s=110, color=colour, marker=mark, label=label,
+            every["ms"], 100.0 * every["error"], s=SIZES[method], color=colour, marker=mark, label=label,
             edgecolors="black", linewidths=0.7, zorder=3,
         )  # fmt: skip
-    front = sorted((row["ms"], 100.0 * row["error"]) for row in rows if row["family"] == "all" and row["front"])
+    front = sorted(
+        (row["ms"], 100.0 * row["error"]) for row in rows if row["family"] == "all" and row["front"]
+    )
     axes.step(*zip(*front, strict=True), where="post", color="0.2", lw=1.0, zorder=2, label="Pareto front")
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -82,8 +86,8 @@ def _coverages(axes: Any, rows: list[dict[str, Any]]) -> None:
     for row in rows:
         _, colour, mark = MARKS[row["method"]]
         axes.scatter(
-            row["ms"], 100.0 * row["coverage"], s=70, color=colour, marker=mark, edgecolors="black",
-            linewidths=0.5, zorder=3,
+            row["ms"], 100.0 * row["coverage"], s=0.6 * SIZES[row["method"]], color=colour, marker=mark,
+            edgecolors="black", linewidths=0.5, zorder=3,
         )  # fmt: skip
     axes.set_ylim(88.0, 100.5)
     axes.grid(color="0.9", lw=0.5)

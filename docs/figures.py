@@ -3,9 +3,9 @@
     .venv/bin/skinnode bench path --json out/path.json --plot out/path.png
     .venv/bin/python docs/figures.py out
 
-The folder may contain {kernel,solve,systems,path,accuracy,stability,trust}.json and the corresponding .png
-files. A table whose file is missing is not changed. ``wrong_models.txt`` is the output of
-docs/wrong_models.py.
+The folder may contain {kernel,solve,systems,path,accuracy,pareto,stability,trust}.json and the corresponding
+.png files; pareto.json is the output of ``skinnode bench accuracy --only pareto``. A table whose file is
+missing is not changed. ``wrong_models.txt`` is the output of docs/wrong_models.py.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from typing import Any
 
 from skinnode.bench import trust_report
 from skinnode.bench.accuracy import best_of_each
+from skinnode.bench.accuracy_pareto import MOTIONS, pooled, sigmas
 
 DOCS = Path(__file__).parent
-PAGES = (DOCS / "solver.md", DOCS / "solver-figures.md")
+PAGES = (DOCS / "solver.md", DOCS / "solver-figures.md", DOCS / "methods.md")
 COLOURS = 256
 """Number of colours to which a picture is reduced; the file size decreases to a quarter without a visible
 change."""
@@ -329,6 +330,29 @@ def exact_data(figures: dict[str, Any]) -> str:
     return f"{summary}\n\n" + table(["method", "wires", "accurate", "flagged", "wrong"], rows)
 
 
+def pareto(figures: dict[str, Any]) -> str:
+    """Return a table of the methods' errors, CPU times and coverage on streams of all families."""
+    rows = [
+        [
+            f"{row['sigma']:.0e}",
+            row["motion"],
+            row["method"],
+            f"{row['ms']:.2f}",
+            percent(row["error"]),
+            "yes" if row["front"] else "",
+            f"{row['coverage']:.1%}",
+            f"{row['coverage_moved']:.1%}",
+            f"{row['far']:.1e}" if row["far"] else "0",
+            f"{row['untrusted']:.1%}",
+        ]
+        for sigma in sigmas(figures)
+        for motion in MOTIONS
+        for row in pooled(figures, sigma, motion)
+    ]
+    head = ["noise", "body", "method", "ms", "median error", "on the front", "in 95 %", "moved", "beyond 5"]
+    return table([*head, "not trusted"], rows)
+
+
 def trust(figures: dict[str, Any]) -> str:
     command = f"This is the output of `skinnode bench trust --seed {figures['seed']}`. {machine(figures)}"
     return f"{command}\n\n```text\n" + "\n".join(trust_report.lines(figures)) + "\n```"
@@ -348,6 +372,7 @@ MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "parts": parts_of_errors,
         "limits": limits,
     },
+    "pareto": {"pareto": pareto},
     "stability": {"stability": stability, "exact data": exact_data},
     "trust": {"trust": trust},
 }

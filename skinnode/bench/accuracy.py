@@ -8,6 +8,7 @@ from typing import Any, Final
 from skinnode.bench import accuracy_families as families
 from skinnode.bench import accuracy_front as front
 from skinnode.bench import accuracy_noise as noise
+from skinnode.bench import accuracy_pareto as pareto
 from skinnode.bench import accuracy_past as past
 from skinnode.bench import accuracy_time as times
 from skinnode.bench.solve import ACCURACY
@@ -78,6 +79,20 @@ def run_past(scenes: int, prior: str, echo: Callable[[str], object]) -> dict[str
     return found
 
 
+def run_pareto(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
+    """Run only the comparison of the methods by error and CPU time, and return the results.
+
+    Args:
+        scenes: Number of scenes of each family.
+        echo: Function that prints a progress line.
+    """
+    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
+    figures |= pareto.run(scenes, echo)
+    figures["must"] = pareto.requirements(figures)
+    found: dict[str, Any] = plain(figures)
+    return found
+
+
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one row per requirement: name, measured value, limit as text, and whether the limit is met.
 
@@ -117,11 +132,11 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     """Print the tables."""
-    if "families" in figures or "past" in figures:
-        part = families if "families" in figures else past
-        part.print_all(figures, echo)
-        _print_must(figures, echo)
-        return
+    for name, part in (("families", families), ("past", past), ("pareto", pareto)):
+        if name in figures:
+            part.print_all(figures, echo)
+            _print_must(figures, echo)
+            return
     _print_front(figures["front"], echo)
     _print_noise(figures["noise"], echo)
     _print_codes(figures["codes"], echo)

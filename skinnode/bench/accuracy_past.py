@@ -81,6 +81,7 @@ class Sum:
     inside: Float = dataclasses.field(default_factory=lambda: np.zeros(2))
     """Numbers of moved coordinates and of coordinates at rest within the 95 % interval."""
     count: Float = dataclasses.field(default_factory=lambda: np.zeros(2))
+    """Numbers of moved coordinates and of coordinates at rest with a finite standard deviation."""
     far: int = 0
     """Number of coordinates beyond :data:`FAR` standard deviations."""
     worst: float = 0.0
@@ -95,12 +96,13 @@ class Sum:
         """Add a frame."""
         error, top = np.abs(field.displacement_m - truth_m), float(np.abs(truth_m).max())
         moved = np.abs(truth_m) >= MOVED * top if top > 0.0 else np.zeros(truth_m.shape, bool)
-        inside = error <= field.half_width_95_m
+        known = np.isfinite(field.displacement_std_m)
+        inside = known & (error <= field.half_width_95_m)
         deviations = error / field.displacement_std_m
         if top > 0.0:
             self.errors.append(float(np.linalg.norm(error) / np.linalg.norm(truth_m)))
         self.inside += [np.count_nonzero(inside & moved), np.count_nonzero(inside & ~moved)]
-        self.count += [np.count_nonzero(moved), np.count_nonzero(~moved)]
+        self.count += [np.count_nonzero(known & moved), np.count_nonzero(known & ~moved)]
         self.far += int(np.count_nonzero(deviations > FAR))
         self.worst = max(self.worst, float(deviations.max()))
         self.contacts += bool(field.contacts)
@@ -111,13 +113,13 @@ class Sum:
     def row(self) -> dict[str, Any]:
         """Return the statistics."""
         with np.errstate(invalid="ignore"):
-            coverage = self.inside / self.count
+            coverage, both = self.inside / self.count, self.inside.sum() / self.count.sum()
         return {
             "error": float(np.median(self.errors)) if self.errors else math.nan,
-            "coverage": float(self.inside.sum() / self.count.sum()),
+            "coverage": float(both),
             "coverage_moved": float(coverage[0]),
             "coverage_rest": float(coverage[1]),
-            "far": self.far / float(self.count.sum()),
+            "far": self.far / max(float(self.count.sum()), 1.0),
             "worst": self.worst,
             "contacts": self.contacts / self.frames,
             "untrusted": self.untrusted / self.frames,
@@ -126,13 +128,16 @@ class Sum:
         }
 
 
-def truth(family: str, skin: Skin, number: int) -> list[tuple[str, Float]]:
+def truth(
+    family: str, skin: Skin, number: int, phases: tuple[Phase, ...] = PHASES
+) -> list[tuple[str, Float]]:
     """Return the phase and the (U, N, 3) true displacement, in metres, for each frame of a scene.
 
     Args:
         family: One of :data:`FAMILIES`.
         skin: Patch to press.
         number: Number of the scene. In odd-numbered scenes, rigid bodies press on a bonded layer.
+        phases: Parts of the stream.
     """
     seed = [number, FAMILIES.index(family)]
     rng = np.random.default_rng([*seed, 1])
@@ -152,7 +157,7 @@ def truth(family: str, skin: Skin, number: int) -> list[tuple[str, Float]]:
         return found
 
     frames, share, shift = [], 0.0, 0.0
-    for phase in PHASES:
+    for phase in phases:
         way = np.linspace(0.0, 1.0, STEPS + 1)
         still = phase.frames == 1 or (phase.share, phase.shift) == (share, shift)
         knots = [

@@ -185,11 +185,12 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
     only: Annotated[
-        Literal["detection", "families", "past"] | None,
+        Literal["detection", "families", "past", "pareto"] | None,
         typer.Option(
             help="Run only this part: the touch detector, both priors on families of loads that neither "
-            "expects, or streams with and without earlier frames. For families, --scenes counts the scenes "
-            "per family, layout and noise level; for past, the scenes per family."
+            "expects, streams with and without earlier frames, or the error of each method against its time. "
+            "For families, --scenes counts the scenes per family, layout and noise level; for past and "
+            "pareto, the scenes per family."
         ),
     ] = None,
     prior: Annotated[
@@ -207,9 +208,9 @@ def accuracy(
 
     The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
     `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
-    false alarms occur. With `--only past`, it measures how much earlier frames improve an estimate. The
-    exit status is 1 if a requirement is not met. There are no requirements on times, because times depend on
-    the machine.
+    false alarms occur. With `--only past`, it measures how much earlier frames improve an estimate; with
+    `--only pareto`, the error and the CPU time of each method on the same streams. The exit status is 1 if a
+    requirement is not met. There are no requirements on times, because times depend on the machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)
@@ -218,21 +219,28 @@ def accuracy(
 
     _prepare(json, plot)
     if only is not None:
-        if plot is not None:
+        if plot is not None and only != "pareto":
             raise typer.BadParameter(f"got --plot, but --only {only} has no plot", param_hint="--plot")
+
+        def progress(line: str) -> None:
+            typer.echo(line, err=True)
+
         if only == "families":
-            figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
+            figures = bench.run_families(scenes, progress)
+        elif only == "past":
+            figures = bench.run_past(scenes, prior, progress)
         else:
-            figures = bench.run_past(scenes, prior, lambda line: typer.echo(line, err=True))
+            figures = bench.run_pareto(scenes, progress)
     else:
         figures = bench.run(scenes, rounds)
     _print_machine(figures)
     bench.print_all(figures, typer.echo)
     _write(json, figures)
     if plot is not None:
-        from skinnode.bench.plots.accuracy import draw
+        from skinnode.bench.plots import accuracy as whole
+        from skinnode.bench.plots import pareto
 
-        draw(plot, figures)
+        (pareto if only == "pareto" else whole).draw(plot, figures)
     if not all(row["reached"] or row["absolute"] for row in figures["must"]):
         raise typer.Exit(1)
 

@@ -217,6 +217,39 @@ def test_a_released_patch_returns_to_rest_and_forgets_the_discs(skin):
     assert (np.abs(field.displacement_m) <= 5.0 * field.displacement_std_m).all()
 
 
+def test_discs_are_fitted_again_as_earlier_frames_reduce_the_noise_of_a_held_press(skin):
+    """The truth is a sphere in closed form; the mean of n frames has the noise of one frame over √n."""
+    sigma, frames = 1e-3, 24
+    common = {"baseline_ohm": skin.rest_ohm, "follow_noise": False, "prior": "discs"}
+    errors = {"off": [], "auto": [], "mean": []}
+    auto = sk.Posterior(skin.layout, relative_noise=sigma, past="auto", **common)
+    off = sk.Posterior(skin.layout, relative_noise=sigma, **common)
+    mean = sk.Posterior(skin.layout, relative_noise=sigma / np.sqrt(frames), **common)
+    inside = count = 0
+    for seed in range(4):
+        random = np.random.default_rng([21, seed])
+        truth = family_scenes.draw("sphere", skin, random, depth=0.2).truth_m
+        ohm = skin.resistance_ohm(truth)
+        readings = ohm * (1 + sigma * random.standard_normal((frames, *ohm.shape)))
+        for posterior in (auto, off, mean):
+            posterior.reset()
+        first = auto.update(readings[0])
+        for reading in readings[1:]:
+            held = auto.update(reading)
+        fields = {"auto": held, "off": off.update(readings[-1]), "mean": mean.update(readings.mean(axis=0))}
+        for name, field in fields.items():
+            errors[name].append(np.linalg.norm(field.displacement_m - truth) / np.linalg.norm(truth))
+        inside += np.count_nonzero(np.abs(held.displacement_m - truth) <= held.half_width_95_m)
+        count += truth.size
+        assert (np.abs(held.displacement_m - truth) <= 5.0 * held.displacement_std_m).all()
+        assert held.half_width_95_m.mean() < 0.6 * first.half_width_95_m.mean()
+        released = auto.update(skin.rest_ohm * (1 + sigma * random.standard_normal(ohm.shape)))
+        assert (np.abs(released.displacement_m) <= 5.0 * released.displacement_std_m).all()
+    assert np.mean(errors["auto"]) < 0.6 * np.mean(errors["off"])
+    assert np.mean(errors["auto"]) < 1.5 * np.mean(errors["mean"])
+    assert inside > 0.92 * count
+
+
 def test_an_unknown_prior_is_refused(skin):
     with pytest.raises(ValueError, match="prior: got 'disc', must be one of cells, discs"):
         sk.Posterior(skin.layout, prior="disc")

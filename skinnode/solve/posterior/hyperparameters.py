@@ -42,6 +42,13 @@ DISC_FITS: Final = 2
 REFIT: Final = 0.1
 """Change in any coordinate since the last fit of the discs, relative to the largest displacement, above
 which the discs are refitted."""
+REFIT_NOISE: Final = 0.8
+"""Noise of a frame, relative to that of the frame to which the discs were fitted, below which the discs are
+refitted. The same applies if the noise increases by the reciprocal. With earlier frames, the noise of a held
+touch falls, and the discs of its first frame would be those of a single noisy frame."""
+RETRY: Final = 2.0
+"""Growth of the largest displacement, in units of the noise, after which discs are tried again for a touch
+whose loads were not found to be local. At the beginning of a slow press, noise hides where the loads are."""
 UNTOUCHED: Final = 0.1
 """Load variance expected on untouched skin, relative to the minimum prior variance of equal loads over the
 whole patch (:data:`SCALE_LEAST`)."""
@@ -92,6 +99,8 @@ class Hyperparameters:
         self.discs = discs
         self._rough = False  # whether the discs were fitted only to a field estimated with the uniform prior
         self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
+        self._fitted_power = math.inf  # sum of 1/noise² over the readings to which the discs were fitted
+        self._rejected = math.inf  # largest displacement over noise when no discs were found
         self._fixed, self._clearance = scale2, clearance
         self._estimate_noise = estimate_noise
         self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
@@ -204,30 +213,46 @@ class Hyperparameters:
     def _set_prior(self, observation: Observation, members: Index, local: bool, refinements: int) -> bool:
         """Estimate the prior from the evidence; return whether it changed."""
         uniform = bool((self._prior.share == 1.0).all())
-        if local and self.discs is not None and (uniform or len(self.discs.discs)):
+        if local and self.discs is not None:
             fits_left = refinements > REFINEMENTS - DISC_FITS
-            return fits_left and self._fit_discs(observation, members, uniform)
+            grown = not uniform and self._size(observation) > RETRY * self._rejected
+            if fits_left and grown and not len(self.discs.discs):
+                self._prior.spread(self._prior.scale2)  # search for discs as in the first frame of a touch
+                self._estimator.track(observation, members)
+                uniform = True
+            if uniform or len(self.discs.discs):
+                return fits_left and self._fit_discs(observation, members, uniform)
         return self._set_scale(local=local, refine=refinements > 0)
+
+    def _size(self, observation: Observation) -> float:
+        """Return the largest displacement, in pitches, divided by the relative noise of all readings."""
+        power = float((observation.weight**2).sum())
+        return float(np.abs(self._estimator.moved).max()) * math.sqrt(power)
 
     def _fit_discs(self, observation: Observation, members: Index, uniform: bool) -> bool:
         """Fit the discs to the frame, unless they already fit; return whether the prior changed.
 
         The first discs of a touch are fitted to data linearised at a field that the uniform prior has
-        blurred. They are therefore refitted to data linearised at the resulting field.
+        blurred. They are therefore refitted to data linearised at the resulting field. If the noise has
+        changed, the discs are refitted even if the field has not moved.
         """
         discs, prior, estimator = self.discs, self._prior, self._estimator
         assert discs is not None
         change = float(np.abs(estimator.moved - self._fitted).max())
         top = float(np.abs(estimator.moved).max())
-        if not (uniform or self._rough) and change < REFIT * top + NOISY * float(estimator.core.max()):
+        power = float((observation.weight**2).sum())
+        same_noise = REFIT_NOISE**2 <= power / self._fitted_power <= REFIT_NOISE**-2
+        moved = change >= REFIT * top + NOISY * float(estimator.core.max())
+        if same_noise and not (uniform or self._rough or moved):
             return False
-        self._fitted[:] = estimator.moved
+        self._fitted[:], self._fitted_power = estimator.moved, power
         strongest = float(np.exp(2.0 * discs.discs[:, 3]).max()) if len(discs.discs) else 0.0
         untouched2 = max(UNTOUCHED * self._least, FAR_LOADS**2 * strongest)
         everywhere2 = prior.scale2 if uniform else self._expected
         variance = discs.fit(observation, members, untouched2, everywhere2, spread=not uniform)
         self._rough = uniform
         if variance is None:
+            self._rejected = top * math.sqrt(power)
             prior.spread(everywhere2)
             estimator.track(observation, members)
             return self._set_scale(local=True, refine=True)

@@ -185,11 +185,12 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
     only: Annotated[
-        Literal["detection", "families", "past"] | None,
+        Literal["detection", "families", "past", "skew"] | None,
         typer.Option(
             help="Run only this part: the touch detector, both priors on families of loads that neither "
-            "expects, or streams with and without earlier frames. For families, --scenes counts the scenes "
-            "per family, layout and noise level; for past, the scenes per family."
+            "expects, streams with and without earlier frames, or scans whose upper wires are sampled one "
+            "after the other. For families, --scenes counts the scenes per family, layout and noise level; "
+            "for past, the scenes per family; for skew, the scenes per row of its table."
         ),
     ] = None,
     prior: Annotated[
@@ -207,9 +208,10 @@ def accuracy(
 
     The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
     `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
-    false alarms occur. With `--only past`, it measures what earlier frames contribute to an estimate. The
-    exit status is 1 if a requirement is not met. No requirement limits a time, because times depend on the
-    machine.
+    false alarms occur. With `--only past`, it measures what earlier frames contribute to an estimate. With
+    `--only skew`, it measures the errors of a moving skin whose upper wires are sampled one after the other.
+    The exit status is 1 if a requirement is not met. No requirement limits a time, because times depend on
+    the machine.
     """
     if only == "detection":
         _detection(json, plot, seed, presses, hours)
@@ -222,6 +224,8 @@ def accuracy(
             raise typer.BadParameter(f"got --plot, which --only {only} cannot draw", param_hint="--plot")
         if only == "families":
             figures = bench.run_families(scenes, lambda line: typer.echo(line, err=True))
+        elif only == "skew":
+            figures = bench.run_skew(scenes, lambda line: typer.echo(line, err=True))
         else:
             figures = bench.run_past(scenes, prior, lambda line: typer.echo(line, err=True))
     else:

@@ -1,9 +1,9 @@
-"""Measures the errors of fields whose upper wires are sampled one after the other, with and without correction.
+"""Measures the errors of a moving skin whose upper wires are sampled one after the other.
 
-In each scene, a rigid body of the simulator is pressed into a bonded layer, held, moved along the skin, held and
-released, at one speed. The simulated patch samples its upper wires one after the other. The true field is that
-at the time at which the first upper wire is sampled. A tracker solves the same readings without and with the
-option ``row_time_s``.
+In each scene, a rigid body of the simulator is pressed into a bonded layer, held, moved along the skin, held
+and released, at one speed. The simulated patch samples its upper wires one after the other. The true field is
+the field at the time at which the first upper wire is sampled. A tracker solves the same readings without and
+with the option ``row_time_s``.
 """
 
 from __future__ import annotations
@@ -188,7 +188,8 @@ def run(scenes: int, echo: Callable[[str], object] = lambda _: None) -> dict[str
         for number in range(scenes):
             family = BONDED[number % len(BONDED)]
             for speed in SPEEDS_M_S:
-                echo(f"{1e3 * period_s:g} ms, rows {1e3 * row_s:g} ms, {1e3 * speed:g} mm/s: {family} {number}")
+                times = f"{1e3 * period_s:g} ms, rows {1e3 * row_s:g} ms"
+                echo(f"{times}, {1e3 * speed:g} mm/s: {family} {number}")
                 body = motion(family, number, skin, speed, period_s)
                 times_s = np.arange(0.0, body.parts[-1][1] + HELD * period_s, period_s).tolist()
                 readings = [patch.analogue_ohm(t_s, body.at) for t_s in times_s]

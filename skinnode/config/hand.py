@@ -163,10 +163,9 @@ class HandConfig(Table):
             return
         wires, period_us = patch.layout.build().shape[0], 1e3 * self.sync.period_ms
         if wires * patch.row_time_us > period_us:
-            allowed = (
-                f"at most {period_us / wires:g}, because {counted(wires, 'upper wire')} must be sampled within "
-                f"one SYNC period of {self.sync.period_ms} ms"
-            )
+            within = f"within one SYNC period of {self.sync.period_ms} ms"
+            sampled = f"{counted(wires, 'upper wire')} must be sampled {within}"
+            allowed = f"at most {period_us / wires:g}, because {sampled}"
             raise ConfigError(f"{key}.row_time_us", patch.row_time_us, allowed)
 
     def _check_links(self) -> None:

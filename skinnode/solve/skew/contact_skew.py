@@ -78,7 +78,9 @@ def _interpolated(
             noise2 = std**2 + ((1.0 + ratio) * last_std) ** 2 + (ratio * before_std) ** 2
     jump2 = f * (1.0 - f) * np.maximum((values - expected) ** 2 - noise2, 0.0)
     return _contact(
-        contact, (1.0 - f) * values + f * last_values, np.hypot((1.0 - f) * std + f * last_std, np.sqrt(jump2))
+        contact,
+        (1.0 - f) * values + f * last_values,
+        np.hypot((1.0 - f) * std + f * last_std, np.sqrt(jump2)),
     )
 
 

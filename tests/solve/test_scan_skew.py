@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skinnode as sk
-from skinnode.model.frames import Contact, FieldFrame, SolveStats
+from skinnode.model.frames import Contact, FieldFrame, SolveStats, amended
 from skinnode.model.status import Status
 from skinnode.solve.skew.scan_skew import ScanSkew
 
 from .press import frame_ohm, hertz_press
 
 PERIOD_S, ROW_S = 0.02, 3e-3
-SIGMA = 1e-5
+SIGMA = 3e-6
 SECOND_NS = 1_000_000_000
-SMALL = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_electrodes=6)
+SMALL = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_wires=24)
 WIRES = np.arange(SMALL.shape[0])
 REST_OHM = sk.resistance_ohm(SMALL, SMALL.upper_m)
 
@@ -37,7 +37,7 @@ def tracker(method: str = "exact", row_time_s: float = ROW_S, **options) -> sk.T
 
 
 def truth_m(depth: Depth, t_s: float) -> np.ndarray:
-    return hertz_press(SMALL, depth(t_s), centre_m=(8e-3, 8e-3))
+    return hertz_press(SMALL, depth(t_s), centre_m=(7.1e-3, 9.3e-3))
 
 
 def reading(depth: Depth, t_s: float, rng: np.random.Generator) -> np.ndarray:
@@ -69,8 +69,8 @@ def largest(fields: list[FieldFrame], errors: np.ndarray) -> float:
 
 
 def pressing(t_s: float) -> float:
-    """A press at 1 mm/s from 0.1 s to 0.6 s, held from then on."""
-    return 0.5 * float(np.clip(t_s - 0.1, 0.0, 0.5))
+    """A press at 0.8 mm/s from 0.1 s to 0.5 s, held from then on."""
+    return 0.4 * float(np.clip(t_s - 0.1, 0.0, 0.4))
 
 
 # -- on the real road ---------------------------------------------------------------------------------------
@@ -82,8 +82,8 @@ def test_a_moving_press_is_at_one_time_and_its_standard_deviations_hold(method):
     without = solved(tracker(method, 0.0), pressing, times)
     corrected = solved(tracker(method), pressing, times)
     before, after = errors_m(without, pressing, times), errors_m(corrected, pressing, times)
-    moving = slice(8, None)
-    assert np.sqrt(np.mean(after[moving] ** 2)) < 0.4 * np.sqrt(np.mean(before[moving] ** 2))
+    moving = slice(8, 24)
+    assert np.sqrt(np.mean(after[moving] ** 2)) < 0.25 * np.sqrt(np.mean(before[moving] ** 2))
     assert largest(without, before) > 8.0
     assert largest(corrected, after) < 5.0
     steady = corrected[moving]
@@ -101,8 +101,9 @@ def test_the_first_wire_and_a_patch_at_rest_keep_their_bits(method):
             np.testing.assert_array_equal(getattr(one, name)[0], getattr(other, name)[0])
     at_rest = [solved(tracker(method, row), lambda _: 0.0, times) for row in (0.0, ROW_S)]
     for one, other in zip(*at_rest, strict=True):
-        if one.touched is False and not one.displacement_m.any():
+        if not one.displacement_m.any():
             np.testing.assert_array_equal(one.displacement_m, other.displacement_m)
+            np.testing.assert_array_equal(one.displacement_std_m, other.displacement_std_m)
 
 
 def test_lost_scans_are_noticed_by_their_times():
@@ -213,7 +214,7 @@ def test_interpolation_never_leaves_the_two_scans_nor_understates_their_noise(se
     assert (found.displacement_std_m >= (1.0 - 1e-12) * least).all()
 
 
-def test_a_jump_at_a_random_time_has_the_stated_mean_and_variance():
+def test_a_jump_at_a_random_time_has_the_stated_mean_and_at_most_the_stated_variance():
     rng = np.random.default_rng(3)
     row_s = 0.9 * PERIOD_S / len(WIRES)
     errors, claims = [], []
@@ -228,7 +229,24 @@ def test_a_jump_at_a_random_time_has_the_stated_mean_and_variance():
         claims.append(found.displacement_std_m[:, 0, 0])
     bias, variance = np.mean(errors, axis=0), np.mean(np.square(errors), axis=0)
     np.testing.assert_allclose(bias, 0.0, atol=4e-6)
-    np.testing.assert_allclose(variance[1:], np.mean(np.square(claims), axis=0)[1:], rtol=0.15)
+    assert (variance <= 1.1 * np.mean(np.square(claims), axis=0) + 1e-18).all()
+    assert (variance[1:] >= 0.5 * np.mean(np.square(claims), axis=0)[1:]).all()
+
+
+def test_a_motion_that_starts_at_a_random_time_has_at_most_the_stated_variance():
+    rng = np.random.default_rng(6)
+    row_s = 0.9 * PERIOD_S / len(WIRES)
+    late = row_s * WIRES[:, None, None]
+    errors, claims = [], []
+    for at_s in PERIOD_S * rng.uniform(size=4000):  # relative to the sample of each wire in the second scan
+        skew = ScanSkew(SMALL, row_s, PERIOD_S)
+        gone = 1e-4 * (PERIOD_S - at_s) * np.ones(SMALL.upper_m.shape)  # until the third scan
+        for number in range(3):
+            found = skew.at_first_wire(field_of(gone if number == 2 else 0.0 * gone, 1e-12), None)
+        true = 1e-4 * np.maximum(PERIOD_S - late - at_s, 0.0)
+        errors.append((found.displacement_m - true)[:, 0, 0] / gone[0, 0, 0])
+        claims.append(found.displacement_std_m[:, 0, 0] / gone[0, 0, 0])
+    assert (np.mean(np.square(errors), axis=0) <= 1.1 * np.mean(np.square(claims), axis=0) + 1e-12).all()
 
 
 def test_a_wire_without_solution_is_left_alone_and_the_next_frame_uses_the_one_before():
@@ -248,8 +266,27 @@ def test_a_wire_without_solution_is_left_alone_and_the_next_frame_uses_the_one_b
             expected[2] = 7e-3
         if number:
             np.testing.assert_allclose(found.displacement_m, expected, rtol=0, atol=1e-13)
+        if number > 1:
             finite = np.isfinite(found.displacement_std_m)
             np.testing.assert_allclose(found.displacement_std_m[finite], 1e-6, rtol=1e-6)
+
+
+def test_a_field_that_contradicts_its_readings_is_not_used_for_the_next():
+    rng = np.random.default_rng(5)
+    start, speed = 1e-4 * rng.standard_normal((2, *SMALL.upper_m.shape))
+    skew = ScanSkew(SMALL, ROW_S, PERIOD_S)
+    for number in range(5):
+        t_s = PERIOD_S * number
+        raw = field_of(sampled(start, speed, t_s, ROW_S))
+        if number == 3:
+            none = np.zeros(len(WIRES), bool)
+            wrong = amended(
+                raw, displacement_m=raw.displacement_m + 1e-3, distrust="wrong", wires_trusted=none
+            )
+            assert skew.at_first_wire(wrong, None).displacement_m is wrong.displacement_m
+        else:
+            found = skew.at_first_wire(raw, None)
+    np.testing.assert_allclose(found.displacement_m, start + speed * t_s, rtol=0, atol=1e-13)
 
 
 def contact(centre_m: tuple[float, float], force_n: float) -> Contact:
@@ -288,5 +325,6 @@ def test_a_new_contact_may_not_have_been_there_when_the_first_wire_was_sampled()
     (found,) = skew.at_first_wire(pressed, None).contacts
     share = 4 * ROW_S / PERIOD_S
     assert found.normal_force_n == pytest.approx(2.0 * (1.0 - share))
-    assert found.normal_force_std_n == pytest.approx(2.0 * np.sqrt(share * (1.0 - share)), rel=1e-3)
+    assert found.normal_force_std_n >= 2.0 * np.sqrt(share * (1.0 - share))
+    assert found.normal_force_std_n < 2.0
     np.testing.assert_array_equal(found.centroid_m[:2], [pitch, 4 * pitch])

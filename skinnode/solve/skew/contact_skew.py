@@ -17,6 +17,7 @@ import numpy as np
 
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.skew.interpolation import timing_variance
 
 SAME_CONTACT: Final = 2.0
 """Maximum distance, in pitches, between the centres of a contact in two successive scans. A body that slides
@@ -76,11 +77,11 @@ def _interpolated(
             before_values, before_std = _values(before)
             expected = last_values + ratio * (last_values - before_values)
             noise2 = std**2 + ((1.0 + ratio) * last_std) ** 2 + (ratio * before_std) ** 2
-    jump2 = f * (1.0 - f) * np.maximum((values - expected) ** 2 - noise2, 0.0)
+    timing2 = timing_variance(f) * np.maximum((values - expected) ** 2 - noise2, 0.0)
     return _contact(
         contact,
         (1.0 - f) * values + f * last_values,
-        np.hypot((1.0 - f) * std + f * last_std, np.sqrt(jump2)),
+        np.hypot((1.0 - f) * std + f * last_std, np.sqrt(timing2)),
     )
 
 

@@ -11,11 +11,10 @@ Interpolation does not raise the noise. Fields are interpolated, not readings, b
 in the displacement, and because a mixture of the readings before and after a jump belongs to no displacement.
 
 The error of the interpolation is estimated from Δ, the difference between the last scan and the line through
-the two scans before it. If the skin jumps by Δ at a random time between two scans, it has already moved at
-the time t with a probability of 1 − f. The interpolation is then the mean, and its variance is f (1 − f) Δ².
-A constant acceleration causes a smaller error, f (1 − f) Δ / 2. The variance of the jump is therefore added
-to that of the field, reduced by the part of Δ that the noise of the fields explains. This part is estimated
-for each wire, because the noise of single coordinates would enlarge their standard deviations at random.
+the two scans before it: Δ may be a jump or a change of speed at an unknown time between two scans
+(:mod:`skinnode.solve.skew.interpolation`). Its variance is added to that of the field, reduced by the part of
+Δ that the noise of the fields explains. This part is estimated for each wire, because the noise of single
+coordinates would enlarge their standard deviations at random.
 
 The loads and contacts of the field are interpolated in the same way.
 """
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.skew.contact_skew import ContactScan, interpolated_contacts
+from skinnode.solve.skew.interpolation import timing_variance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,26 +49,28 @@ class _Solved:
     t_ns: NDArray[np.int64]
     """(U, 1, 1) time of the scan, in ns."""
     known: NDArray[np.bool_]
-    """(U, 1, 1) mask of the wires that have been solved."""
+    """(U, 1, 1) mask of the wires with a usable solution."""
 
     @classmethod
     def of(cls, field: FieldFrame, t_ns: int) -> Self:
-        """Return the solution of a field."""
+        """Return the solution of a field. If its readings contradict each other, no wire is known."""
         moved, std, core = field.displacement_m, field.displacement_std_m, field.core_std_m
         known = np.isfinite(std).all(axis=(1, 2), keepdims=True)
+        if field.wires_trusted is not None and not field.wires_trusted.any():
+            known = np.zeros_like(known)
         if not known.all():
             std = np.where(known, std, 0.0)
             core = None if core is None else np.where(known, core, 0.0)
         force = np.zeros_like(moved) if field.force_n is None else field.force_n
         return cls(moved, std, std if core is None else core, force, np.full(known.shape, t_ns), known)
 
-    def followed_by(self, new: Self) -> Self:
-        """Return the newest solution of each wire: that of ``new`` if the wire was solved, else this one."""
-        if new.known.all():
+    def replaced(self, new: Self, wires: NDArray[np.bool_]) -> Self:
+        """Return the solution ``new`` of the wires in the mask (U, 1, 1), and this one of the others."""
+        if wires.all():
             return new
         return type(self)(
             *(
-                np.where(new.known, getattr(new, each.name), getattr(self, each.name))
+                np.where(wires, getattr(new, each.name), getattr(self, each.name))
                 for each in dataclasses.fields(self)
             )
         )
@@ -90,7 +92,7 @@ class ScanSkew:
 
     def __init__(self, layout: PatchLayout, row_time_s: float, period_s: float) -> None:
         wires = layout.shape[0]
-        if wires * row_time_s > period_s:
+        if wires * row_time_s > (1.0 + 1e-9) * period_s:  # a limit computed from microseconds is rounded
             raise ValueError(
                 f"row_time_s: got {row_time_s}, must be at most {period_s / wires:g}, because {wires} upper "
                 f"wires must be sampled within scan_period_s = {period_s:g}"
@@ -105,12 +107,14 @@ class ScanSkew:
         self._last: _Solved | None = None
         self._before: _Solved | None = None
         self._contacts: tuple[ContactScan, ...] = ()  # of the last two fields
-        self._now_ns, self._given_ns = 0, None
+        self._now_ns = 0
+        self._given_ns: int | None = None  # time of the last frame, as given
 
     def at_first_wire(self, field: FieldFrame, t_ns: int | None) -> FieldFrame:
         """Return a field at the time at which the first upper wire was sampled.
 
-        A wire is not changed if it has no solution in this field or no earlier solution.
+        A wire is not changed if it has no solution in this field or no earlier solution. The field of a patch
+        at rest is not changed, nor is a field that contradicts its readings.
 
         Args:
             field: Next field of the stream, in which each upper wire belongs to its own time.
@@ -119,10 +123,10 @@ class ScanSkew:
         now_ns = self._advance(t_ns)
         new, last, before = _Solved.of(field, now_ns), self._last, self._before
         scan, scans = ContactScan(now_ns, field.contacts), self._contacts
-        self._last = new if last is None else last.followed_by(new)
-        self._before = last if before is None or last is None else before.followed_by(last)
+        self._last = new if last is None else last.replaced(new, new.known)
+        self._before = last if before is None or last is None else before.replaced(last, new.known)
         self._contacts = (scan, *scans[:1])
-        if last is None or _is_still(new, last, before):
+        if last is None or not (new.known.any() and new.moved_m.any()) or _is_still(new, last, before):
             return field
         field = _interpolated(field, new, last, last if before is None else before, self._late_ns)
         if not field.contacts:
@@ -167,11 +171,11 @@ def _interpolated(
     chi2 = np.where(uncertain, off2 / np.where(uncertain, noise2, 1.0), 0.0).sum(axis=(1, 2), keepdims=True)
     count = uncertain.sum(axis=(1, 2), keepdims=True)
     unexplained = 1.0 - np.minimum(count / np.maximum(chi2, 1e-300), 1.0)
-    jump_m = np.sqrt(f * (1.0 - f) * unexplained * off2)
+    timing_m = np.sqrt(timing_variance(f) * unexplained * off2)
     changed = np.broadcast_to(f > 0.0, change.shape)
 
     def widened(std_m: Float, own_m: Float, last_m: Float) -> Float:
-        return np.where(changed, np.hypot((1.0 - f) * own_m + f * last_m, jump_m), std_m)
+        return np.where(changed, np.hypot((1.0 - f) * own_m + f * last_m, timing_m), std_m)
 
     force, core = field.force_n, field.core_std_m
     return amended(

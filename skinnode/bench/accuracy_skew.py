@@ -111,7 +111,8 @@ def motion(family: str, number: int, skin: Skin, speed_m_s: float, period_s: flo
     far = min(FARTHEST, SLIDE_S * speed_m_s / skin.layout.pitch_m)
     press_s = DEPTH * skin.layout.height_m / speed_m_s
     rng = np.random.default_rng([number, FAMILIES.index(family), 3])
-    parts, at_s = [], 0.0
+    parts: list[tuple[float, float, Callable[[float], Float]]] = []
+    at_s = 0.0
     for ends, lasts_s in (
         (((0.0, 0.0), (1.0, 0.0)), press_s),
         (((1.0, 0.0), (1.0, far)), far * skin.layout.pitch_m / speed_m_s),

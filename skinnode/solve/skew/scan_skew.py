@@ -13,8 +13,7 @@ in the displacement, and because a mixture of the readings before and after a ju
 The error of the interpolation is estimated from Δ, the difference between the last scan and the line through
 the two scans before it: Δ may be a jump or a change of speed at an unknown time between two scans
 (:mod:`skinnode.solve.skew.interpolation`). Its variance is added to that of the field, reduced by the part of
-Δ that the noise of the fields explains. This part is estimated for each wire, because the noise of single
-coordinates would enlarge their standard deviations at random.
+Δ that the noise of the fields explains.
 
 The loads and contacts of the field are interpolated in the same way.
 """
@@ -167,10 +166,7 @@ def _interpolated(
     change = new.moved_m - last.moved_m
     off2 = (change - ratio * (last.moved_m - before.moved_m)) ** 2
     noise2 = new.std_m**2 + ((1.0 + ratio) * last.std_m) ** 2 + (ratio * before.std_m) ** 2
-    uncertain = noise2 > 0.0
-    chi2 = np.where(uncertain, off2 / np.where(uncertain, noise2, 1.0), 0.0).sum(axis=(1, 2), keepdims=True)
-    count = uncertain.sum(axis=(1, 2), keepdims=True)
-    unexplained = 1.0 - np.minimum(count / np.maximum(chi2, 1e-300), 1.0)
+    unexplained = _unexplained(off2, noise2)
     timing_m = np.sqrt(timing_variance(f) * unexplained * off2)
     changed = np.broadcast_to(f > 0.0, change.shape)
 
@@ -185,3 +181,19 @@ def _interpolated(
         core_std_m=None if core is None else widened(core, new.core_m, last.core_m),
         force_n=None if force is None else new.force_n - f * (new.force_n - last.force_n),
     )
+
+
+def _unexplained(off2: Float, noise2: Float) -> float:
+    """Return the part of the squared deviations that noise does not explain, 0 to 1.
+
+    The wire that deviates most decides for the whole patch, because its motion is one. If it changes its speed,
+    deviations as small as their noise are considered real, too.
+
+    Args:
+        off2: (U, N, 3) squared deviations of the last scan from a line, in m².
+        noise2: (U, N, 3) variances of these deviations due to noise, in m²; 0 for coordinates that are fixed.
+    """
+    uncertain = noise2 > 0.0
+    ratio = np.where(uncertain, off2 / np.where(uncertain, noise2, 1.0), 0.0)
+    excess = ratio.sum(axis=(1, 2)) / np.maximum(uncertain.sum(axis=(1, 2)), 1)
+    return 1.0 - 1.0 / max(float(excess.max()), 1.0)

@@ -10,6 +10,7 @@ from skinnode.bench import accuracy_front as front
 from skinnode.bench import accuracy_noise as noise
 from skinnode.bench import accuracy_pareto as pareto
 from skinnode.bench import accuracy_past as past
+from skinnode.bench import accuracy_skew as skew
 from skinnode.bench import accuracy_time as times
 from skinnode.bench.solve import ACCURACY
 from skinnode.bench.timing import machine
@@ -93,6 +94,20 @@ def run_pareto(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
     return found
 
 
+def run_skew(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
+    """Run only the scenes whose upper wires are sampled one after the other, and return the results.
+
+    Args:
+        scenes: Number of scenes for each scan period, row time, speed, noise and method.
+        echo: Function that prints a progress line.
+    """
+    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
+    figures |= skew.run(scenes, echo)
+    figures["must"] = skew.requirements(figures)
+    found: dict[str, Any] = plain(figures)
+    return found
+
+
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one row per requirement: name, measured value, limit as text, and whether the limit is met.
 
@@ -132,7 +147,8 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     """Print the tables."""
-    for name, part in (("families", families), ("past", past), ("pareto", pareto)):
+    parts = (("families", families), ("past", past), ("skew", skew), ("pareto", pareto))
+    for name, part in parts:
         if name in figures:
             part.print_all(figures, echo)
             _print_must(figures, echo)

@@ -185,12 +185,13 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
     only: Annotated[
-        Literal["detection", "families", "past", "pareto"] | None,
+        Literal["detection", "families", "past", "skew", "pareto"] | None,
         typer.Option(
             help="Run only this part: the touch detector, both priors on families of loads that neither "
-            "expects, streams with and without earlier frames, or the error of each method against its time. "
-            "For families, --scenes counts the scenes per family, layout and noise level; for past and "
-            "pareto, the scenes per family."
+            "expects, streams with and without earlier frames, scans whose upper wires are sampled one after "
+            "the other, or the error of each method against its time. For families, --scenes counts the "
+            "scenes per family, layout and noise level; for past and pareto, the scenes per family; for skew, "
+            "the scenes per row of its table."
         ),
     ] = None,
     prior: Annotated[
@@ -209,6 +210,7 @@ def accuracy(
     The benchmark also measures the coverage of confidence intervals and the solve time per scan. With
     `--only detection`, it measures which touches the detector finds, how soon it finds them, and how many
     false alarms occur. With `--only past`, it measures how much earlier frames improve an estimate; with
+    `--only skew`, the errors of a moving skin whose upper wires are sampled one after the other; with
     `--only pareto`, the error and the CPU time of each method on the same streams. The exit status is 1 if a
     requirement is not met. There are no requirements on times, because times depend on the machine.
     """
@@ -229,6 +231,8 @@ def accuracy(
             figures = bench.run_families(scenes, progress)
         elif only == "past":
             figures = bench.run_past(scenes, prior, progress)
+        elif only == "skew":
+            figures = bench.run_skew(scenes, progress)
         else:
             figures = bench.run_pareto(scenes, progress)
     else:

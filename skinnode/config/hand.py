@@ -149,12 +149,24 @@ class HandConfig(Table):
             if patch.bus not in names:
                 raise ConfigError(f"patches[{i}].bus", patch.bus, f"a bus of this file: {', '.join(names)}")
             _check_geometry(f"patches[{i}]", patch)
+            self._check_row_time(f"patches[{i}]", patch)
         _require_unique("patches", "node_id", [(patch.bus, patch.node_id) for patch in self.patches])
         serials = [object() if patch.serial is None else patch.serial for patch in self.patches]
         _require_unique("patches", "serial", serials)
         self._check_links()
         self._check_roles()
         return self
+
+    def _check_row_time(self, key: str, patch: PatchConfig) -> None:
+        """Check that all upper wires of a patch can be sampled within a SYNC period."""
+        if not patch.row_time_us:
+            return
+        wires, period_us = patch.layout.build().shape[0], 1e3 * self.sync.period_ms
+        if wires * patch.row_time_us > period_us:
+            within = f"within one SYNC period of {self.sync.period_ms} ms"
+            sampled = f"{counted(wires, 'upper wire')} must be sampled {within}"
+            allowed = f"at most {period_us / wires:g}, because {sampled}"
+            raise ConfigError(f"{key}.row_time_us", patch.row_time_us, allowed)
 
     def _check_links(self) -> None:
         """Check that each link is defined once and has at least one patch."""

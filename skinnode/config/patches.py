@@ -37,6 +37,9 @@ _Resistivity = Annotated[
 _Noise = Annotated[
     float, Field(ge=1e-12, lt=1, allow_inf_nan=False), Allowed("a number of at least 1e-12 and below 1")
 ]
+_RowTime = Annotated[
+    float, Field(ge=0, le=1e6, allow_inf_nan=False), Allowed("a number from 0 to 1e6 (µs)")
+]
 _RUBBER = Rubber()
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
 _Tolerance = Annotated[
@@ -257,6 +260,9 @@ class PatchConfig(Table):
     relative_noise: _Noise = 3e-6
     """Relative standard deviation of the analogue noise in a resistance measurement, excluding
     quantization."""
+    row_time_us: _RowTime = 0.0
+    """Time between the samples of successive upper wires in a scan, µs; 0 if all upper wires are sampled at
+    once. If it is given, fields belong to the time at which the first upper wire was sampled."""
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None

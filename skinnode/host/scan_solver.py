@@ -127,6 +127,7 @@ def tracker_options(
         detect=config.detect,
         false_alarms_per_hour=config.false_alarms_per_hour,
         scan_period_s=period_s,
+        row_time_s=1e-6 * patch.row_time_us,
     )
 
 

@@ -35,7 +35,8 @@ class ScanStamp:
     10 bits. Object 0x2011:4 contains the node's time with a resolution of 1 µs.
     """
     t_sync_ns: int
-    """Time at which the SYNC of this scan was sent or received; 0 if unknown."""
+    """Time at which the SYNC of this scan was sent or received; 0 if unknown. The field belongs to this time,
+    apart from the constant delay until the node samples the first upper wire."""
     t_receive_ns: int
     """Time at which the last frame of the scan was received."""
     t_solved_ns: int = 0
@@ -129,7 +130,12 @@ class FieldFrame:
     """Displacement field of a patch, including its uncertainty and the status of each wire."""
 
     displacement_m: Float
-    """(U, N, 3) displacement from the rest position, in metres."""
+    """(U, N, 3) displacement from the rest position, in metres.
+
+    It belongs to the time of the scan, at which all upper wires were sampled. If they are sampled one after
+    the other and the row time is configured (``row_time_us``), this is the time at which the first upper wire
+    was sampled; without a configured row time, each wire belongs to its own sampling time.
+    """
     displacement_std_m: Float
     """(U, N, 3) standard deviation due to noise in the resistances, in metres; inf where the displacement is
     unknown. Where the prior contributes to the displacement, the standard deviation is enlarged to cover rare

@@ -11,7 +11,7 @@ from typing import Any, Final
 from skinnode.config import HandConfig, PatchConfig, SolverConfig, parse_hand
 from skinnode.errors import ConfigError
 
-_PATCH_KEYS: Final = ("relative_noise", "calibration", "tolerances", "layout")
+_PATCH_KEYS: Final = ("relative_noise", "row_time_us", "calibration", "tolerances", "layout")
 """Patch keys that describe the skin rather than the patch's identity on the bus."""
 _EVERY_PATCH: Final = "*"
 _ALLOWED: Final = (
@@ -152,6 +152,6 @@ def _split(text: str) -> list[str]:
 def capture_hand(hand: HandConfig) -> HandConfig:
     """Return the hand without solver settings; variants with equal results share captured scans."""
     plain = PatchConfig(name="any", node_id=1)
-    same = {"calibration": plain.calibration, "tolerances": plain.tolerances}
+    same = {key: getattr(plain, key) for key in ("row_time_us", "calibration", "tolerances")}
     patches = tuple(patch.model_copy(update=same) for patch in hand.patches)
     return hand.model_copy(update={"patches": patches, "solver": SolverConfig()})

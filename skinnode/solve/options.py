@@ -157,6 +157,9 @@ class TrackerOptions(EstimateOptions):
         false_alarms_per_hour: Accepted number of touches per hour reported because of noise alone.
         scan_period_s: Time between successive frames, in s. The detector uses this time to model gain drift
             and to limit the number of false alarms.
+        row_time_s: Time between the samples of successive upper wires in a frame, in s; 0 if all upper wires
+            are sampled at once. If it is given, the displacements and loads of a moving skin are those at the
+            time at which the first upper wire was sampled (:mod:`skinnode.solve.skew`).
 
     Raises:
         ValueError: If an option is out of range.
@@ -172,6 +175,7 @@ class TrackerOptions(EstimateOptions):
     detect: bool = True
     false_alarms_per_hour: float = 0.1
     scan_period_s: float = 0.08
+    row_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.method not in TRACKER_METHODS:
@@ -181,6 +185,8 @@ class TrackerOptions(EstimateOptions):
                 require_positive(name, limit)
         require_positive("scan_period_s", self.scan_period_s)
         require_positive("false_alarms_per_hour", self.false_alarms_per_hour)
+        if not (math.isfinite(self.row_time_s) and self.row_time_s >= 0):
+            raise ValueError(f"row_time_s: got {self.row_time_s}, must be finite and at least 0")
         super().__post_init__()
 
     def of_posterior(self) -> PosteriorOptions:
@@ -240,6 +246,7 @@ class TrackerArguments(EstimateArguments, total=False):
     detect: bool
     false_alarms_per_hour: float
     scan_period_s: float
+    row_time_s: float
 
 
 _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)

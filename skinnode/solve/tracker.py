@@ -14,6 +14,9 @@ crosses the limit for ``exact``. The new method starts at the rest position.
 
 On request, the posterior also uses the readings of earlier frames (:mod:`skinnode.solve.posterior.past`), but
 no readings from before an untouched frame or a gap in the stream.
+
+If the upper wires are sampled one after the other, the field of a moving skin is moved to the time of the
+first wire at the end (:mod:`skinnode.solve.skew`). All solvers and tests work on the fields as solved.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.precision import is_precise, limits_of
 from skinnode.solve.root_gate import RootGate
+from skinnode.solve.skew.scan_skew import ScanSkew
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
@@ -70,8 +74,8 @@ class Tracker:
         method: Method in use, ``exact`` or ``posterior``. With ``auto``, it can change during a stream.
         reason: Short explanation of why this method is in use.
         t_ns: Time of the next frame on any monotonic clock, in ns. After a gap in the stream, the detector
-            allows for drift in the meantime, and the posterior uses no earlier frames; if None (the default),
-            gaps are not noticed.
+            allows for drift in the meantime, and no earlier frames are used; if None (the default), gaps and
+            lost frames are not noticed.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -92,6 +96,9 @@ class Tracker:
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
         self._rest = RestGate(layout, options) if options.detect else None
+        self._skew: ScanSkew | None = None
+        if options.row_time_s:
+            self._skew = ScanSkew(layout, options.row_time_s, options.scan_period_s)
         self._decoder = None if options.codes is None else CodeDecoder(options.codes)
         self._stated = broadcast_noise(options.relative_noise, layout)
         self._stated_of_codes = (
@@ -142,6 +149,8 @@ class Tracker:
         self._posterior.reset()
         if self._rest is not None:
             self._rest.reset()
+        if self._skew is not None:
+            self._skew.reset()
         if self._exact is None:
             return
         self._exact.reset()
@@ -182,7 +191,7 @@ class Tracker:
             noise = None if relative_noise is None else broadcast_noise(relative_noise, self.layout)
             rest = self._at_rest(ohm, mask, noise)
             if rest is not None:
-                return rest
+                return self._at_one_time(rest)
         if self._exact is None or self.method == "posterior":
             field = self._posterior.update(frame_ohm, valid, relative_noise)
         else:
@@ -214,7 +223,7 @@ class Tracker:
             ohm, _, invalid = self._decoder.decode(checked_codes(codes, self.layout))
             rest = self._at_rest(ohm, None, None, meaning)  # invalid codes are NaN
             if rest is not None:
-                return rest, invalid
+                return self._at_one_time(rest), invalid
         if self._exact is None or self.method == "posterior":
             ohm, valid = meaning.decode(checked_codes(codes, self.layout))
             noise, rounding_ohm = meaning.relative_noise, meaning.rounding_ohm
@@ -246,11 +255,13 @@ class Tracker:
             self._check.scan = number
 
     def _note_gap(self) -> None:
-        """Make the posterior forget the frames before a gap in the stream."""
+        """Forget the frames before a gap in the stream."""
         now, last = self.t_ns, self._last_ns
         self._last_ns = now
         if now is not None and last is not None and not 0 <= now - last <= GAP_NS:
             self._posterior.forget_past()
+            if self._skew is not None:
+                self._skew.reset()
 
     def _at_rest(
         self, ohm: Float, valid: NDArray[np.bool_] | None, noise: Float | None, codes: CodeMap | None = None
@@ -277,10 +288,19 @@ class Tracker:
         return field
 
     def _finished(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of a solved frame with ``precise`` and the detector's results added."""
+        """Return the field of a solved frame at one time, with ``precise`` and the detector's results."""
         self._follow_noise()
         field = self._judged(field)
-        return field if self._rest is None else self._rest.add(field)
+        return self._at_one_time(field if self._rest is None else self._rest.add(field))
+
+    def _at_one_time(self, field: FieldFrame) -> FieldFrame:
+        """Return a field at the time at which the first upper wire was sampled, if this option is set."""
+        if self._skew is None:
+            return field
+        moved = self._skew.at_first_wire(field, self.t_ns)
+        if moved is field:
+            return field
+        return amended(moved, precise=is_precise(moved, self._limits))
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
         """Test the readings of an exact field; return the field with its data faults and trust attributes."""

@@ -115,7 +115,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             3,
             "patches[1].nodeid: got an unknown key, allowed: a key of this table "
             "(did you mean node_id?): name, node_id, bus, link, pose, eds, layout, code_bits, "
-            "serial, relative_noise, baseline, calibration, tolerances",
+            "serial, relative_noise, row_time_us, baseline, calibration, tolerances",
         ),
         (
             ["colour"],
@@ -129,6 +129,17 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             "solver.false_alarms_per_hour: got 0, allowed: a number from 1e-6 to 1e4 (1/h)",
         ),
         (["solver", "past"], "on", "solver.past: got 'on', allowed: off or auto"),
+        (
+            ["patches", 1, "row_time_us"],
+            -1,
+            "patches[1].row_time_us: got -1, allowed: a number from 0 to 1e6 (µs)",
+        ),
+        (
+            ["patches", 1, "row_time_us"],
+            8001,
+            "patches[1].row_time_us: got 8001.0, allowed: at most 8000, because 10 upper wires must be "
+            "sampled within one SYNC period of 80 ms",
+        ),
         (
             ["sync", "overflow"],
             240,

@@ -334,6 +334,40 @@ def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
     np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=1e-6)
 
 
+def test_the_field_of_a_moving_skin_belongs_to_the_time_of_its_scan(
+    make_hand: Callable[..., HandConfig], publisher: Publisher, ticks: Ticks
+) -> None:
+    """The third scan is lost, and the upper wires are sampled one after the other."""
+    hand, row_s, speed_m_s = make_hand(1, solver={"method": "exact"}), 5e-3, 1e-3
+    patch = hand.patches[0].model_copy(update={"row_time_us": 1e6 * row_s})
+    facts = NodeFacts(patch, LAYOUT, PROFILE, CodeScale(), REST_OHM, None, 0.25)
+    stream = PatchStream(
+        "thumb",
+        ScanAssembler(PROFILE, counter_overflow=240),
+        StreamOutput(Inline(), publisher),
+        StreamOptions(ticks.find),
+    )
+    stream.resume(ScanSolver(facts, hand.solver), 0, anew=True)
+    fields = publisher.subscribe(10, 10.0, None)
+    for number in (1, 2, 4):
+        t_s = 0.08 * number
+        sampled_s = t_s + row_s * np.arange(LAYOUT.shape[0])[:, None]
+        upper_m = LAYOUT.upper_m.copy()
+        upper_m[..., 2] -= speed_m_s * sampled_s
+        ohm = resistance_ohm(LAYOUT, upper_m)
+        chunks = pack_scan(encode(ohm, REST_OHM, CodeScale()), number, PROFILE)
+        for chunk in chunks:
+            stream.on_chunk(chunk, round(1e9 * t_s))
+        stream.on_summary(
+            pack_summary(number, SummaryFlag(0), len(chunks), 80_000 * number), round(1e9 * t_s)
+        )
+        field = fields.get(0)
+        assert field is not None
+    assert field.trusted
+    errors = field.displacement_m[..., 2] + speed_m_s * t_s
+    np.testing.assert_allclose(errors, 0.0, atol=0.4 * speed_m_s * row_s)
+
+
 def test_drift_while_sync_pauses_is_no_touch(
     make_hand: Callable[..., HandConfig], publisher: Publisher, ticks: Ticks
 ) -> None:

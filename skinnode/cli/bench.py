@@ -190,8 +190,8 @@ def accuracy(
             help="Run only this part: the touch detector, both priors on families of loads that neither "
             "expects, streams with and without earlier frames, scans whose upper wires are sampled one after "
             "the other, or the error of each method against its time. For families, --scenes counts the "
-            "scenes per family, layout and noise level; for past and pareto, the scenes per family; for skew, "
-            "the scenes per row of its table."
+            "scenes per family, layout and noise level; for past and pareto, the scenes per family; for "
+            "skew, the scenes per row of its table."
         ),
     ] = None,
     prior: Annotated[

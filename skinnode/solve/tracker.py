@@ -240,7 +240,7 @@ class Tracker:
             else:
                 ohm, valid = meaning.decode(codes)
                 invalid -= int(np.count_nonzero(left_out & valid))
-                field = self._checked(field, ohm, start)
+                field = self._checked(field, ohm, start, left_out & valid)
         return self._finished(field), invalid
 
     @property
@@ -302,15 +302,28 @@ class Tracker:
             return field
         return amended(moved, precise=is_precise(moved, self._limits))
 
-    def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
-        """Test the readings of an exact field; return the field with its data faults and trust attributes."""
+    def _checked(
+        self, field: FieldFrame, ohm: Float, start: float, unsent: NDArray[np.bool_] | None = None
+    ) -> FieldFrame:
+        """Test the readings of an exact field; return the field with its data faults and trust attributes.
+
+        Args:
+            field: The field.
+            ohm: (U, K) resistances, in ohms.
+            start: Start of the update, as a value of :func:`skinnode.process.clock.perf_counter`, in s.
+            unsent: (U, K) mask of valid readings that the solver did not receive, and whose noise it
+                therefore does not know; None if there are none.
+        """
         exact = self._exact
         assert exact is not None
         its = exact.arrays
         a = ohm * self._problem.gain
 
         def solved(field: FieldFrame) -> Solved:
-            return Solved(field, a, its.noise, its.used > 0)
+            noise = its.noise
+            if unsent is not None:
+                noise = np.where(unsent, self._factor * self._stated_of_codes, noise)
+            return Solved(field, a, noise, its.used > 0)
 
         def solve_without(left_out: NDArray[np.bool_]) -> Solved:
             return solved(self._gate.check(exact.update_again(left_out), perf_counter(), again=True))

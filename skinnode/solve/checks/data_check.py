@@ -105,6 +105,7 @@ class DataCheck:
         sigma: Typical relative noise of a reading, for :meth:`prepare`.
         model_std: Standard deviation of the forward model's error, relative to the largest change in a
             reading; 0 if the patch matches its layout exactly.
+        noise_varies: Whether each frame has its own noise factor, so that a change says nothing about faults.
         drift: Expected gain errors, which are not reported as faults: ``none``, ``patch`` (one error for the
             patch) or ``wire`` (one for each upper wire).
 
@@ -114,9 +115,15 @@ class DataCheck:
     """
 
     def __init__(
-        self, problem: PatchProblem, sigma: float, model_std: float = 0.0, drift: str = "none"
+        self,
+        problem: PatchProblem,
+        sigma: float,
+        model_std: float = 0.0,
+        drift: str = "none",
+        *,
+        noise_varies: bool = False,
     ) -> None:
-        self._sigma = sigma
+        self._sigma, self._noise_varies = sigma, noise_varies
         self._readings = LinearisedReadings(problem, model_std, drift)
         self._explainer = Explainer(self._readings.model)
         self._time = ExaminationTime()
@@ -180,7 +187,7 @@ class DataCheck:
         """
         self._frame += 1
         last = self._last
-        if last is not None and last.noise_factor != solved.field.noise_factor:
+        if last is not None and not self._noise_varies and last.noise_factor != solved.field.noise_factor:
             self._list.reset()  # the faults were found at a different noise level
             self._lead = 0.0
         if self._list.mask is None and self._is_clean(solved):
@@ -259,11 +266,16 @@ class DataCheck:
         field = solved.field
         if not self._is_complete(solved):
             return False
-        if field.held is not None and field.held.all():
+        if field.held is not None and field.held.all() and not self._doubted:
             return True
         moved = field.displacement_m.reshape(self._shape[0], -1)
         self._readings.set_complete(moved, float(solved.noise.mean()))
         return self._needs_no_explanation(self._readings.gains()) and not self._unusual_change(solved)
+
+    @property
+    def _doubted(self) -> bool:
+        """Whether the last field was not trusted or not examined, so that it cannot be held without a test."""
+        return self._last is not None and (bool(self._last.distrust) or self._unexamined)
 
     def _is_complete(self, solved: Solved) -> bool:
         """Return whether the exact inverse computed the field from all readings."""

@@ -65,11 +65,13 @@ class RestGate:
         )
         self._factor, self._period_s = 1.0, options.scan_period_s
         self.t_ns: int | None = None
-        self._stated, self._layout = float(np.median(noise)), layout
+        self._usual, self._layout = noise, layout
+        self._stated = self._usual_level = float(np.median(noise))
         self.reset()
 
     def reset(self) -> None:
         """Discard the state of the stream."""
+        self._restore()
         self.detector.reset()
         self._verdict = TouchVerdict(None, 0.0, False)
         self._field: FieldFrame | None = None
@@ -97,7 +99,9 @@ class RestGate:
         self._count_missing()
         if left_out is not None:
             valid = ~left_out if valid is None else valid & ~left_out
-        if noise is not None:
+        if noise is None:
+            self._restore()
+        else:
             self._adapt(noise)
             noise = self._factor * noise
         self._noise = noise
@@ -171,6 +175,13 @@ class RestGate:
         if self.detector.complete:
             return self._used is None
         return self._used is not None and np.array_equal(self._used, self.detector.used)
+
+    def _restore(self) -> None:
+        """Let the detector assume the stated noise again, after frames with noise of their own."""
+        if self._stated != self._usual_level:
+            self._stated = self._usual_level
+            self.detector.set_noise(self._factor, self._usual)
+            self._field = None
 
     def _adapt(self, noise: Float) -> None:
         """Adapt the detector if the frame's noise differs from the noise that the detector assumes."""

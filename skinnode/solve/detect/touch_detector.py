@@ -190,6 +190,7 @@ class TouchDetector:
             self._own = noise.copy()
         self._configure()
         self._slow.carry_on(gains, expected * before / self._sigma)
+        self._crept_peak *= float(np.median(before) / np.median(self._sigma)) ** 2  # an energy over the noise
         self._arrays.expected[:] = self._slow.expected
         self._noise, self._noise_frames, self._frames = 1.0, NOISE_START, 0
         if self.touched:
@@ -249,11 +250,12 @@ class TouchDetector:
         if valid is not None:
             weight = np.where(valid, weight, 0.0)
         its.weight[:] = weight
-        self._at = (self._at + 1) % KEPT
+        before, self._at = (self._at, self._frames), (self._at + 1) % KEPT
         self._frames = min(self._frames + 1, KEPT)
         self._compute(self._noise * (1.0 + self._slow.offset_share))
         found = its.found.tolist()
         if found[COUNT] < ENOUGH * its.ohm.size:
+            self._at, self._frames = before[0], min(before[1], KEPT - 1)  # the oldest frame is overwritten
             self.miss(1)
             return TouchVerdict(None, bounded_exp(self._log_odds), False)
         self._clock += 1
@@ -272,7 +274,8 @@ class TouchDetector:
             frames: Number of frames.
         """
         self._clock += frames
-        self._frames = 0
+        if frames >= KEPT:
+            self._frames = 0
         if self._slow.miss(frames) and not self.touched:
             self._change_test()
 

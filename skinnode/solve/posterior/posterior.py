@@ -66,7 +66,13 @@ class Posterior(FrameEstimator):
     ) -> None:
         super().__init__(layout, merged(PosteriorOptions, options, arguments))
         noise = float(np.median(self._noise))
-        self.check = DataCheck(self._problem, noise, _model_std(self.options), self.options.drift)
+        self.check = DataCheck(
+            self._problem,
+            noise,
+            _model_std(self.options),
+            self.options.drift,
+            noise_varies=self.options.estimate_noise,
+        )
         self._past: FrameFilter | None = None
         self._factor = 1.0  # noise factor of the frames in the filter
         self._solved_share = 1.0  # noise in the last solve, relative to the noise of its frame alone

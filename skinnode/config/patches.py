@@ -37,9 +37,7 @@ _Resistivity = Annotated[
 _Noise = Annotated[
     float, Field(ge=1e-12, lt=1, allow_inf_nan=False), Allowed("a number of at least 1e-12 and below 1")
 ]
-_RowTime = Annotated[
-    float, Field(ge=0, le=1e6, allow_inf_nan=False), Allowed("a number from 0 to 1e6 (µs)")
-]
+_RowTime = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False), Allowed("a number from 0 to 1e6 (µs)")]
 _RUBBER = Rubber()
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
 _Tolerance = Annotated[

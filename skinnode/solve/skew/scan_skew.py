@@ -54,7 +54,7 @@ class _Solved:
     def of(cls, field: FieldFrame, t_ns: int) -> Self:
         """Return the solution of a field. If its readings contradict each other, no wire is known."""
         moved, std, core = field.displacement_m, field.displacement_std_m, field.core_std_m
-        known = np.isfinite(std).all(axis=(1, 2), keepdims=True)
+        known = np.asarray(np.isfinite(std).all(axis=(1, 2), keepdims=True))
         if field.wires_trusted is not None and not field.wires_trusted.any():
             known = np.zeros_like(known)
         if not known.all():
@@ -97,7 +97,7 @@ class ScanSkew:
                 f"wires must be sampled within scan_period_s = {period_s:g}"
             )
         self._layout = layout
-        self._late_ns = 1e9 * row_time_s * np.arange(wires)[:, None, None]
+        self._late_ns: Float = 1e9 * row_time_s * np.arange(wires, dtype=np.float64)[:, None, None]
         self._period_ns = round(1e9 * period_s)
         self.reset()
 
@@ -186,8 +186,8 @@ def _interpolated(
 def _unexplained(off2: Float, noise2: Float) -> float:
     """Return the part of the squared deviations that noise does not explain, 0 to 1.
 
-    The wire that deviates most decides for the whole patch, because its motion is one. If it changes its speed,
-    deviations as small as their noise are considered real, too.
+    The wire that deviates most decides for the whole patch. If it has changed its speed, the deviations of
+    the other wires are considered real, even if they are as small as their noise.
 
     Args:
         off2: (U, N, 3) squared deviations of the last scan from a line, in m².

@@ -24,7 +24,7 @@ from skinnode.bench.truth import Skin
 from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.tracker import Tracker
 
-METHODS: Final[dict[str, dict[str, str] | None]] = {
+METHODS: Final[dict[str, dict[str, Any] | None]] = {
     "exact": None,
     "cells": {"prior": "cells", "past": "off"},
     "cells, past": {"prior": "cells", "past": "auto"},

@@ -101,6 +101,7 @@ class Hyperparameters:
         self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
         self._fitted_power = math.inf  # sum of 1/noise² over the readings to which the discs were fitted
         self._rejected = math.inf  # largest displacement over noise when no discs were found
+        self._may_retry = False  # whether this happened in an earlier frame
         self._fixed, self._clearance = scale2, clearance
         self._estimate_noise = estimate_noise
         self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
@@ -147,7 +148,8 @@ class Hyperparameters:
         return np.sqrt(std**2 + variance)
 
     def set_least(self, observation: Observation) -> None:
-        """Set the minimum prior scale from the noise of a frame."""
+        """Begin a new frame: set the minimum prior scale from its noise."""
+        self._may_retry = True
         power = float((observation.weight**2 * self._signal).sum())
         count = np.count_nonzero(observation.weight)
         least = SCALE_LEAST**2 * count / power if power > 0 else math.inf
@@ -215,8 +217,8 @@ class Hyperparameters:
         uniform = bool((self._prior.share == 1.0).all())
         if local and self.discs is not None:
             fits_left = refinements > REFINEMENTS - DISC_FITS
-            grown = not uniform and self._size(observation) > RETRY * self._rejected
-            if fits_left and grown and not len(self.discs.discs):
+            cells = self._may_retry and fits_left and not (uniform or len(self.discs.discs))
+            if cells and self._size(observation) > RETRY * self._rejected:
                 self._prior.spread(self._prior.scale2)  # search for discs as in the first frame of a touch
                 self._estimator.track(observation, members)
                 uniform = True
@@ -252,7 +254,7 @@ class Hyperparameters:
         variance = discs.fit(observation, members, untouched2, everywhere2, spread=not uniform)
         self._rough = uniform
         if variance is None:
-            self._rejected = top * math.sqrt(power)
+            self._rejected, self._may_retry = top * math.sqrt(power), False
             prior.spread(everywhere2)
             estimator.track(observation, members)
             return self._set_scale(local=True, refine=True)

@@ -274,7 +274,7 @@ class DataCheck:
 
     @property
     def _doubted(self) -> bool:
-        """Whether the last field was not trusted or not examined, so that it cannot be held without a test."""
+        """Whether the last field was not trusted or not examined, so that holding it needs a test."""
         return self._last is not None and (bool(self._last.distrust) or self._unexamined)
 
     def _is_complete(self, solved: Solved) -> bool:

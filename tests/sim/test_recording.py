@@ -11,7 +11,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.config import BusConfig, HandConfig, parse_hand
-from skinnode.errors import ConfigError
+from skinnode.errors import BusError, ConfigError
 from skinnode.process import clock
 from skinnode.transport import CanPort
 from skinnode.transport.frame_log_reader import FrameLogReader
@@ -184,6 +184,19 @@ def test_what_cannot_be_recorded_or_replayed(tmp_path: Path) -> None:
     assert trace_of(tmp_path) == empty
     with pytest.raises(ConfigError, match="at least one frame"):
         channels_in(empty)
+
+
+def test_a_bus_that_cannot_be_opened_leaves_no_folder(tmp_path: Path) -> None:
+    plan, folder = hand("virtual"), tmp_path / "run"
+    closed = plan.on("timed", None)  # needs virtual time
+    scene = parse_scene({"faults": [{"where": "palm", "fault": "silent"}]})
+    for _ in range(2):
+        with pytest.raises(BusError), Recording(folder, Fleet(closed), scene):
+            pass
+        assert not folder.exists()
+    with Recording(folder, Fleet(plan)):
+        pass
+    assert trace_of(folder).read_text() == ""
 
 
 FOREIGN = """(1.000000) can0 00000123#00

@@ -151,6 +151,8 @@ class Fleet:
     def start(self) -> None:
         """Compute the initial part of the scene, open the buses and power on the nodes.
 
+        A stopped fleet can be started again. Its scene, which has not paused, continues at the current time.
+
         Raises:
             BusError: If a bus cannot be opened. Buses already opened are closed again.
         """

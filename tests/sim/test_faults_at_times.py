@@ -103,6 +103,8 @@ def test_what_is_printed_is_parsed_to_the_same_faults() -> None:
         ("palm:lost", "--fault lost: got '', allowed: a number"),
         ("palm:silent=", "--fault silent: got '', allowed: no value, or true or false"),
         ("palm:", "--fault: got '', allowed: the name of a fault, or none"),
+        ("palm:seed=-1", "seed: got -1, allowed: a non-negative integer"),
+        ("can0:seed=-1", "seed: got -1, allowed: a non-negative integer"),
         ("palm:lost=2", "lost: got 2.0, allowed: a fraction from 0 to 1"),
         ("palm:open_upper=7", "palm: open_upper: got 7, allowed: an integer from 0 to 3"),
     ],
@@ -306,6 +308,38 @@ def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> No
     with Fleet(HAND, scene=scene({"where": "palm", "fault": "silent"})) as fleet:
         clock.sleep(1.0)
     assert fleet.faults.log == ()
+
+
+def test_the_schedule_of_a_fleet_that_is_started_again_goes_on(virtual: VirtualClock) -> None:
+    plan = scene(
+        {"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 1.0},
+        {"where": "palm", "fault": "silent", "from_s": 0.8, "to_s": 1.2},  # while the fleet is stopped
+        {"where": "thumb", "fault": "lost=0.5", "from_s": 4.0, "to_s": 5.0},
+    )
+    fleet = Fleet(HAND, scene=plan)
+    with fleet, sk.Host.from_config(HAND):
+        until(fleet, 0.5)
+    until(fleet, 2.0)
+    assert fleet.faults.texts() == ["palm:frozen"]
+    with fleet, sk.Host.from_config(HAND):
+        until(fleet, 6.0)
+        found = events(fleet)
+    assert found == [
+        (0.2, "palm:frozen on"),
+        (2.0, "palm:frozen off"),
+        (4.0, "thumb:lost=0.5 on"),
+        (5.0, "thumb:lost=0.5 off"),
+    ]
+
+
+def test_a_fleet_is_started_again_before_its_scene_begins(virtual: VirtualClock) -> None:
+    fleet = Fleet(HAND, scene=scene({"where": "palm", "fault": "frozen"}))
+    for _ in range(2):
+        with fleet:
+            clock.sleep(0.1)
+    with fleet, sk.Host.from_config(HAND):
+        until(fleet, 0.1)
+        assert fleet.faults.texts() == ["palm:frozen"]
 
 
 def table(**changes: Any) -> str:

@@ -44,7 +44,7 @@ class BusFaults:
     """Faults on one bus; none by default.
 
     Raises:
-        ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
+        ConfigError: If a fraction is not between 0 and 1, or if the seed or a rate is negative.
     """
 
     seed: int = 1
@@ -63,6 +63,8 @@ class BusFaults:
     interface supports this fault."""
 
     def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ConfigError("seed", self.seed, "a non-negative integer")
         for name in _SHARES:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ConfigError(name, getattr(self, name), "a fraction from 0 to 1")

@@ -198,6 +198,8 @@ class Faults:
     """Rate of stray frames with the unused COB-ID 0x3F0, 1/s."""
 
     def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ConfigError("seed", self.seed, "a non-negative integer")
         for name in _SHARES:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ConfigError(name, getattr(self, name), "a fraction from 0 to 1")

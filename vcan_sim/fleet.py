@@ -151,6 +151,8 @@ class Fleet:
     def start(self) -> None:
         """Compute the initial part of the scene, open the buses and power on the nodes.
 
+        A stopped fleet can be started again. Its scene, which has not paused, continues at the current time.
+
         Raises:
             BusError: If a bus cannot be opened. Buses already opened are closed again.
         """
@@ -295,6 +297,8 @@ class Fleet:
     def truth(self, patch: str, device_time_us: int) -> PatchTruth:
         """Return the ground truth at the time of a scan: displacement, contacts, pressure and wrench.
 
+        See :meth:`truth_at` for the effects of the imperfections.
+
         Args:
             patch: Name of the patch.
             device_time_us: Device time in the scan's summary, in µs.
@@ -314,6 +318,10 @@ class Fleet:
     def truth_at(self, patch: str, t_ns: int) -> PatchTruth:
         """Return the ground truth at a given time: displacement, contacts, pressure and wrench.
 
+        The displacement is that of the simulated patch, like :meth:`displacement_m`: it includes creep and
+        hysteresis, and each upper wire has the time at which a scan that starts at ``t_ns`` samples it. The
+        contacts and the wrench are those of the scene at ``t_ns``, on an elastic skin without imperfections.
+
         Args:
             patch: Name of the patch.
             t_ns: Monotonic time, in ns.
@@ -322,8 +330,10 @@ class Fleet:
             LookupError: If the fleet has no scene, or the patch is unknown.
         """
         self._require_scene()
-        t_s = self._stations[patch].source.scene_s(t_ns)
-        return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
+        source = self._stations[patch].source
+        t_s = source.scene_s(t_ns)
+        truth = self._scenes[patch].truth(-1.0 if t_s is None else t_s)
+        return replace(truth, displacement_m=source.displacement_m(t_ns))
 
     def scene_s(self, t_ns: int) -> float | None:
         """Return the scene time (s) that corresponds to a monotonic time; None before the scene starts.

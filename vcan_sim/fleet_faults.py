@@ -154,29 +154,43 @@ class FleetFaults:
             self._replace({}, {name: faults})
 
     def follow(self, ended: Iterable[TimedFault], started: Iterable[TimedFault]) -> None:
-        """Apply scheduled changes. A change that contradicts other faults is refused and logged.
+        """Apply scheduled changes. A start that contradicts other faults is refused and logged.
+
+        A fault that ends as another starts at the same place changes into it, unless the start is refused.
 
         Args:
             ended: Scheduled faults to end.
             started: Scheduled faults to start.
         """
-        by_place: dict[tuple[str, bool], dict[str, Value]] = {}
+        ends: dict[tuple[str, bool], dict[str, Value]] = {}
+        starts: dict[tuple[str, bool], dict[str, Value]] = {}
         for each in ended:
             defaults = {name: _default(name, each.on_bus) for name in each.values}
-            by_place.setdefault((each.place, each.on_bus), {}).update(defaults)
+            ends.setdefault((each.place, each.on_bus), {}).update(defaults)
         for each in started:
-            by_place.setdefault((each.place, each.on_bus), {}).update(each.values)
-        for (place, on_bus), values in by_place.items():
+            starts.setdefault((each.place, each.on_bus), {}).update(each.values)
+        for place, on_bus in ends | starts:
+            ending, starting = ends.get((place, on_bus), {}), starts.get((place, on_bus), {})
             try:
-                self._change([FaultChange(place, on_bus, values)])
-            except ConfigError as error:
-                now_ns = clock.time_ns()
-                self._log += [
-                    FaultEvent(now_ns, place, name, value, value != _default(name, on_bus), str(error))
-                    for name, value in values.items()
-                ]
+                self._change([FaultChange(place, on_bus, ending | starting)])
+            except ConfigError:
+                self._try(FaultChange(place, on_bus, ending))
+                self._try(FaultChange(place, on_bus, starting))
 
     # --- internal
+
+    def _try(self, change: FaultChange) -> None:
+        """Apply a change, or log it as refused."""
+        try:
+            self._change([change])
+        except ConfigError as error:
+            now_ns = clock.time_ns()
+            self._log += [
+                FaultEvent(
+                    now_ns, change.place, name, value, value != _default(name, change.on_bus), str(error)
+                )
+                for name, value in change.values.items()
+            ]
 
     def _change(self, changes: Iterable[FaultChange]) -> None:
         with self._lock:

@@ -161,14 +161,18 @@ class SkinTest:
         if self.scene is not None:
             (folder / "scene.json").write_text(self.scene.model_dump_json(indent=1), encoding="utf-8")
             kept.append("scene.json")
-            try:
-                from vcan_sim.scenes.plot import write_plot
-
-                write_plot(self.scene, fleet.hand, folder / "scene.png")
-                kept.append("scene.png")
-            except ImportError:  # matplotlib is an optional dependency
-                pass
+            if self.scene.touches:
+                kept += self._keep_plot(self.scene, fleet, folder)
         return kept
+
+    def _keep_plot(self, scene: SceneConfig, fleet: Fleet, folder: Path) -> list[str]:
+        try:
+            from vcan_sim.scenes.plot import write_plot
+
+            write_plot(scene, fleet.hand, folder / "scene.png")
+        except ImportError:  # matplotlib is an optional dependency
+            return []
+        return ["scene.png"]
 
     def _on_bus(self, hand: HandConfig) -> HandConfig:
         interface, channel = BUSES[self.bus]

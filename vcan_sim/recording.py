@@ -14,6 +14,7 @@ scene.json       the scene, if there is one
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import threading
@@ -64,7 +65,7 @@ class Recording:
 
     Raises:
         ConfigError: On entry, if the folder already exists or cannot be created.
-        BusError: On entry, if a bus cannot be opened.
+        BusError: On entry, if a bus cannot be opened. The folder is removed again.
         OSError: From any method, if a file cannot be written.
     """
 
@@ -84,6 +85,15 @@ class Recording:
         except OSError as error:
             allowed = f"a new folder that can be created ({error.strerror})"
             raise ConfigError("--record", str(self._folder), allowed) from None
+        try:
+            self._begin()
+        except BaseException:  # nothing has been recorded, and a further attempt needs a new folder
+            self._discard()
+            raise
+        return self
+
+    def _begin(self) -> None:
+        """Write the scene, and start recording the frames on all buses."""
         if self._scene is not None:
             text = self._scene.model_dump_json(indent=1)
             (self._folder / SCENE).write_text(text, encoding="utf-8")
@@ -93,9 +103,14 @@ class Recording:
             channels = channels_of(bus.name for bus in buses)
             for bus in buses:
                 opened.enter_context(Listener(bus, self._write, channels[bus.name]))
+            self.poll()
             self._open = opened.pop_all()
-        self.poll()
-        return self
+
+    def _discard(self) -> None:
+        with contextlib.suppress(OSError):
+            for name in (SCENE, TRACE, FAULTS):
+                (self._folder / name).unlink(missing_ok=True)
+            self._folder.rmdir()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -9,7 +9,7 @@ from typing import Final
 
 from skinnode.errors import BusError, ConfigError
 from skinnode.process import clock
-from skinnode.transport import CanPort
+from skinnode.transport import CanPort, Frame
 from skinnode.transport.frame_log import LoggedFrame
 from skinnode.transport.frame_log_reader import FrameLogReader
 from vcan_sim.recording import TRACE
@@ -37,7 +37,8 @@ class Replayed:
 
     sent: int
     left_out: int
-    """Number of frames left out: unselected frames, extended frames and error frames."""
+    """Number of frames left out: unselected frames, extended frames, error frames and, on a classic CAN bus,
+    CAN FD frames."""
     refused: int
     """Number of frames that the bus refused."""
     seconds: float
@@ -100,8 +101,7 @@ def replay(
         frame = logged.frame
         first_ns = frame.t_ns if first_ns is None else first_ns
         port = ports.get(logged.channel)
-        kind = kind_of(frame.can_id, frame.data, frame.remote)
-        if port is None or frame.extended or frame.error or (from_nodes and kind not in FROM_NODES):
+        if port is None or not _can_send(port, frame) or (from_nodes and not _is_from_node(frame)):
             left_out += 1
             continue
         left_s = (begin_ns + frame.t_ns - first_ns - clock.monotonic_ns()) * 1e-9
@@ -116,6 +116,14 @@ def replay(
             for each in ports.values():
                 _drain(each)
     return Replayed(sent, left_out, refused, (clock.monotonic_ns() - begin_ns) * 1e-9)
+
+
+def _can_send(port: CanPort, frame: Frame) -> bool:
+    return not (frame.extended or frame.error or (frame.fd and not port.config.fd))
+
+
+def _is_from_node(frame: Frame) -> bool:
+    return kind_of(frame.can_id, frame.data, frame.remote) in FROM_NODES
 
 
 def _drain(port: CanPort) -> None:

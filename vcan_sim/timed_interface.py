@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, Final, cast
 
@@ -31,7 +31,7 @@ from vcan_sim.virtual_time import Mailbox, VirtualClock
 COALESCED_NS: Final = 1_000_000
 """Minimum interval between wake-ups of a thread that reads frames, in ns."""
 MOST_STATIONS: Final = 64
-"""Maximum number of endpoints that can be opened on a bus. Closed endpoints count too."""
+"""Maximum number of endpoints that can be open on a bus at the same time."""
 
 
 class Inbox:
@@ -110,7 +110,9 @@ class Segment:
         for station in range(MOST_STATIONS):
             self.bus.disconnect(now_ns, station)
         self.listeners: list[Callable[[Event], None]] = []
-        self._inboxes: list[Inbox] = []
+        self._inboxes: dict[int, Inbox] = {}
+        # The station that left first is used first, so that no frame on the bus began before it left.
+        self._unused = deque(range(MOST_STATIONS))
         self._leaving: set[int] = set()
         self._connected: set[int] = set()
         self._due_ns: int | None = None
@@ -118,17 +120,22 @@ class Segment:
         """CPU time (ns) spent on simulating the bus, by thread name; None if it is not measured."""
 
     def join(self) -> int:
-        """Connect a new station and return its number."""
-        station = len(self._inboxes)
-        if station == MOST_STATIONS:
-            raise can.CanInitializationError(f"{self.channel}: cannot open more than {station} endpoints")
-        self._inboxes.append(Inbox(self.clock))
+        """Connect a station that is not in use, and return its number."""
+        if not self._unused:
+            raise can.CanInitializationError(
+                f"{self.channel}: cannot open more than {MOST_STATIONS} endpoints at the same time"
+            )
+        station = self._unused.popleft()
+        if station in self._inboxes:  # used before: it must not receive or send frames of the closed endpoint
+            self.catch_up()
+            self.bus.clear(self.clock.now_ns, station)
+        self._inboxes[station] = Inbox(self.clock)
         self._connected.add(station)
         self.bus.connect(self.clock.now_ns, station)
         return station
 
     def leave(self, station: int) -> None:
-        """Disconnect a station permanently once its queued frames have been sent, like a closed socket."""
+        """Disconnect a station once its queued frames have been sent, like a closed socket."""
         self._leaving.add(station)
         self._disconnect()
         self._plan()
@@ -207,6 +214,7 @@ class Segment:
                 self.bus.disconnect(self.clock.now_ns, station)
                 self._leaving.remove(station)
                 self._connected.remove(station)
+                self._unused.append(station)
 
 
 def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:

@@ -119,7 +119,8 @@ class Tester:
                 return frame
         end_s = clock.monotonic() + within_s
         while (left_s := end_s - clock.monotonic()) > 0:
-            if self._receive(left_s) and wanted(self._inbox[-1]):
+            received = self._receive(left_s)
+            if received is not None and not self._ignored(received) and wanted(received):
                 return self._inbox.pop()
         return None
 
@@ -168,16 +169,19 @@ class Tester:
     def _fetch(self) -> None:
         # On a fully loaded bus, frames never stop arriving.
         for _ in range(_INBOX_FRAMES):
-            if not self._receive(0.0):
+            if self._receive(0.0) is None:
                 return
 
-    def _receive(self, timeout_s: float) -> bool:
+    def _receive(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None if none arrives. Unless it is ignored, it is put into the inbox."""
         frame = self._port.recv(timeout_s)
-        if frame is None or frame.error or frame.extended or (frame.fd and not self.fd):
-            return False
-        self._note(frame.t_ns, False, frame.can_id, frame.data, frame.remote)
-        self._inbox.append(frame)
-        return True
+        if frame is not None and not self._ignored(frame):
+            self._note(frame.t_ns, False, frame.can_id, frame.data, frame.remote)
+            self._inbox.append(frame)
+        return frame
+
+    def _ignored(self, frame: Frame) -> bool:
+        return frame.error or frame.extended or (frame.fd and not self.fd)
 
     def _note(self, t_ns: int, sent: bool, can_id: int, data: bytes, remote: bool) -> None:
         self._trace.append(TraceLine((t_ns - self._begun_ns) * 1e-9, sent, can_id, data, remote))

@@ -103,6 +103,8 @@ def test_what_is_printed_is_parsed_to_the_same_faults() -> None:
         ("palm:lost", "--fault lost: got '', allowed: a number"),
         ("palm:silent=", "--fault silent: got '', allowed: no value, or true or false"),
         ("palm:", "--fault: got '', allowed: the name of a fault, or none"),
+        ("palm:seed=-1", "seed: got -1, allowed: a non-negative integer"),
+        ("can0:seed=-1", "seed: got -1, allowed: a non-negative integer"),
         ("palm:lost=2", "lost: got 2.0, allowed: a fraction from 0 to 1"),
         ("palm:open_upper=7", "palm: open_upper: got 7, allowed: an integer from 0 to 3"),
     ],
@@ -226,6 +228,29 @@ def test_a_scheduled_change_that_contradicts_is_refused(virtual: VirtualClock) -
     assert "at most 1 together" in text
 
 
+def test_a_fault_ends_although_the_next_one_is_refused(virtual: VirtualClock) -> None:
+    plan = scene(
+        {"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 0.4},
+        {"where": "palm", "fault": "lost=0.6", "from_s": 0.4, "to_s": 0.6},
+    )
+    with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
+        fleet.faults.inject("palm:duplicated=0.6")
+        until(fleet, 0.5)
+        assert fleet.faults.texts() == ["palm:duplicated=0.6"]
+        found = [(time, text.partition(": ")[0]) for time, text in events(fleet) if time > 0.3]
+    assert found == [(0.4, "palm:frozen off"), (0.4, "palm:lost=0.6 on, refused")]
+
+
+def test_a_fault_that_goes_on_in_another_table_does_not_pause(virtual: VirtualClock) -> None:
+    plan = scene(
+        {"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 0.4},
+        {"where": "palm", "fault": "frozen", "from_s": 0.4, "to_s": 0.6},
+    )
+    with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
+        until(fleet, 0.7)
+        assert events(fleet) == [(0.2, "palm:frozen on"), (0.6, "palm:frozen off")]
+
+
 def test_a_patch_drifts_and_warms(virtual: VirtualClock) -> None:
     """The node sends R / R0: 1 + 0.1 t while it drifts, and 1.02 at ten kelvin."""
     plan = scene(
@@ -285,6 +310,38 @@ def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> No
     assert fleet.faults.log == ()
 
 
+def test_the_schedule_of_a_fleet_that_is_started_again_goes_on(virtual: VirtualClock) -> None:
+    plan = scene(
+        {"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 1.0},
+        {"where": "palm", "fault": "silent", "from_s": 0.8, "to_s": 1.2},  # while the fleet is stopped
+        {"where": "thumb", "fault": "lost=0.5", "from_s": 4.0, "to_s": 5.0},
+    )
+    fleet = Fleet(HAND, scene=plan)
+    with fleet, sk.Host.from_config(HAND):
+        until(fleet, 0.5)
+    until(fleet, 2.0)
+    assert fleet.faults.texts() == ["palm:frozen"]
+    with fleet, sk.Host.from_config(HAND):
+        until(fleet, 6.0)
+        found = events(fleet)
+    assert found == [
+        (0.2, "palm:frozen on"),
+        (2.0, "palm:frozen off"),
+        (4.0, "thumb:lost=0.5 on"),
+        (5.0, "thumb:lost=0.5 off"),
+    ]
+
+
+def test_a_fleet_is_started_again_before_its_scene_begins(virtual: VirtualClock) -> None:
+    fleet = Fleet(HAND, scene=scene({"where": "palm", "fault": "frozen"}))
+    for _ in range(2):
+        with fleet:
+            clock.sleep(0.1)
+    with fleet, sk.Host.from_config(HAND):
+        until(fleet, 0.1)
+        assert fleet.faults.texts() == ["palm:frozen"]
+
+
 def table(**changes: Any) -> str:
     values = {"where": "palm", "fault": "lost=0.1", "from_s": 1.0, "to_s": 2.0} | changes
     lines = [f"{key} = {value!r}" for key, value in values.items() if value is not None]
@@ -314,6 +371,11 @@ def table(**changes: Any) -> str:
         (table(ends=3.0), "6:1", ["faults[0].ends", "unknown key", "to_s"]),
         (table() + table(from_s=1.5), "9:1", ["faults[1].from_s", "faults[0]", "lost at 'palm'"]),
         (table(fault="lost=0.8") + table(fault="late=0.8"), "3:1", ["1.6", "at most 1 together"]),
+        (
+            table(fault="stuck_upper=1") + table(fault="stuck_lower=1", to_s=3.0),
+            "5:1",
+            ["faults[0].to_s: got 2.0", "the remaining faults", "stuck_lower needs both"],
+        ),
         ("repeat_s = 1.5\n" + table(), "6:1", ["faults[0].to_s", "2.0", "repeat_s"]),
         ("name = 'nothing'\n", "", ["touches", "nothing", "[[touches]] or [[faults]]"]),
     ],

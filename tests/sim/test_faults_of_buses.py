@@ -19,7 +19,7 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import load_scene, parse_scene
 from vcan_sim.testing import eventually
 from vcan_sim.timed_bus import BitRates, Cause, Delivered, ErrorFrame, Event
-from vcan_sim.timed_interface import segment
+from vcan_sim.timed_interface import MOST_STATIONS, segment
 from vcan_sim.virtual_time import READINGS, VirtualClock
 
 SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
@@ -81,6 +81,13 @@ def test_bus_off(running: Running) -> None:
     assert running.fleet.tally("palm").emitted.total() == sent
     running.fleet.inject_bus("can0", NO_BUS_FAULTS)
     assert running.fleet.injected_bus("can0").bus_off == 1
+    running.comes_back()
+
+
+def test_the_nodes_come_back_after_a_long_bus_off(running: Running) -> None:
+    running.fleet.inject_bus("can0", BusFaults(bus_off=True))
+    clock.sleep(1.2 * MOST_STATIONS)  # the nodes reopen their port about once a second
+    running.fleet.inject_bus("can0", NO_BUS_FAULTS)
     running.comes_back()
 
 

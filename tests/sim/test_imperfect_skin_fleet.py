@@ -11,9 +11,11 @@ import pytest
 from skinnode.config import HandConfig, SimulationConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Host
+from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.default_scene import Scene
 from vcan_sim.fleet import Fleet
+from vcan_sim.scenes import parse_scene
 from vcan_sim.sensor import SimulatedPatch
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
@@ -85,6 +87,32 @@ def test_one_for_all_patches_or_by_name() -> None:
         ConfigError, match=r"^imperfections: got 'p7', allowed: a patch of the hand: p0, p1, p2"
     ):
         Fleet(plan, imperfections={"p7": ORDINARY})
+
+
+def test_the_truth_of_a_scene_is_what_the_node_measures() -> None:
+    """The product's forward model, at the true displacement, gives the resistances of a skin that creeps."""
+    press = {
+        "body": "ball",
+        "patch": "p0",
+        "at_m": [0.006, 0.006],
+        "depth_m": 2e-4,
+        "from_s": 0.1,
+        "to_s": 2.0,
+    }
+    scene = parse_scene(
+        {"bodies": [{"name": "ball", "shape": "sphere", "radius_m": 0.02}], "touches": [press]}
+    )
+    sizes = Imperfections(creep=ORDINARY.creep, hysteresis=0.05, row_time_s=1e-3)
+    fleet = Fleet(hand(), scene=scene, imperfections=sizes)
+    patch = fleet.patches["p0"]
+    layout = patch.scene.layout
+    patch.start(S)
+    for t_s in (0.2, 1.0, 1.95, 2.2):  # the press begins, goes on, ends, and has left the skin
+        t_ns = S + round(t_s * S)
+        moved_m = fleet.truth_at("p0", t_ns).displacement_m
+        assert np.abs(moved_m).max() > 1e-7
+        expected_ohm = resistance_ohm(layout, layout.upper_m + moved_m)
+        np.testing.assert_allclose(patch.exact_ohm(t_ns), expected_ohm, rtol=1e-9)
 
 
 @pytest.mark.parametrize("period_ms", [100, 700])  # frames of 700 ms have little in common

@@ -132,6 +132,15 @@ def test_what_a_failure_keeps(in_virtual_time: Run) -> None:
     assert (folder / "scene.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_scene_of_faults_is_kept_without_a_plot(tmp_path: Path) -> None:
+    (tmp_path / "faults.toml").write_text("[[faults]]\nwhere = 'palm'\nfault = 'frozen'\n")
+    (tmp_path / "test_faults.py").write_text(
+        "def test_fails(skin_hand):\n    skin_hand('hand.toml', scene='faults.toml')\n    assert False\n"
+    )
+    printed = run(tmp_path, "test_faults.py").stdout
+    assert "test_faults.py_test_fails: trace.log, truth.npz, scene.json\n" in printed
+
+
 EXAMPLE = str(Path(__file__).parents[2] / "examples" / "hand.toml")
 
 

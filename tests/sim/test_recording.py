@@ -11,7 +11,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.config import BusConfig, HandConfig, parse_hand
-from skinnode.errors import ConfigError
+from skinnode.errors import BusError, ConfigError
 from skinnode.process import clock
 from skinnode.transport import CanPort
 from skinnode.transport.frame_log_reader import FrameLogReader
@@ -186,13 +186,39 @@ def test_what_cannot_be_recorded_or_replayed(tmp_path: Path) -> None:
         channels_in(empty)
 
 
-def test_frames_that_cannot_be_sent_are_left_out(tmp_path: Path) -> None:
+def test_a_bus_that_cannot_be_opened_leaves_no_folder(tmp_path: Path) -> None:
+    plan, folder = hand("virtual"), tmp_path / "run"
+    closed = plan.on("timed", None)  # needs virtual time
+    scene = parse_scene({"faults": [{"where": "palm", "fault": "silent"}]})
+    for _ in range(2):
+        with pytest.raises(BusError), Recording(folder, Fleet(closed), scene):
+            pass
+        assert not folder.exists()
+    with Recording(folder, Fleet(plan)):
+        pass
+    assert trace_of(folder).read_text() == ""
+
+
+FOREIGN = """(1.000000) can0 00000123#00
+(1.000000) can0 18FF0104#00
+(1.000000) can0 20000004#0000000000000000
+(1.000000) can0 184##1000000000000000000000000
+(1.000100) can0 704#05
+(1.000200) can1 704#05
+"""
+"""Two extended frames, an error frame, a CAN FD frame, a classic frame, and a frame of another bus."""
+
+
+@pytest.mark.parametrize(("fd", "sent"), [(False, [0x704]), (True, [0x184, 0x704])])
+@pytest.mark.parametrize("from_nodes", [False, True])
+def test_frames_that_cannot_be_sent_are_left_out(
+    tmp_path: Path, fd: bool, sent: list[int], from_nodes: bool
+) -> None:
     file = tmp_path / "a.log"
-    file.write_text("(1.000000) can0 00000123#00\n(1.000100) can0 123#00\n(1.000200) can1 123#00\n")
-    bus = BusConfig(interface="virtual", channel=str(tmp_path))
+    file.write_text(FOREIGN)
+    bus = BusConfig(interface="virtual", channel=str(tmp_path), fd=fd)
     with CanPort(bus) as port, CanPort(bus) as reader:
-        done = replay(FrameLogReader(file), {"can0": port}, wait=lambda _: False)
-        assert (done.sent, done.left_out) == (1, 2)
-        frame = reader.recv(1.0)
-        assert frame is not None
-        assert frame.can_id == 0x123
+        done = replay(FrameLogReader(file), {"can0": port}, wait=lambda _: False, from_nodes=from_nodes)
+        assert (done.sent, done.left_out) == (len(sent), 6 - len(sent))
+        heard = [reader.recv(1.0) for _ in sent]
+    assert [frame and frame.can_id for frame in heard] == sent

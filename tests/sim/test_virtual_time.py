@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
+from contextlib import ExitStack
 from types import FrameType
 
 import can
@@ -17,6 +18,7 @@ import pytest
 
 from skinnode.process import clock
 from vcan_sim.event_loop import run
+from vcan_sim.timed_interface import MOST_STATIONS
 from vcan_sim.virtual_time import START_NS, Deadlock, VirtualClock
 
 
@@ -219,6 +221,31 @@ def test_what_an_endpoint_has_sent_arrives_although_it_is_closed() -> None:
         with can.Bus(**options) as alone:
             alone.send(can.Message(arbitration_id=1, is_extended_id=False))
         clock.sleep(1.0)
+
+
+def test_endpoints_can_be_opened_and_closed_without_limit() -> None:
+    """A new endpoint neither sends nor receives frames of the closed endpoints."""
+    with VirtualClock():
+        options = {"interface": "timed", "channel": "a", "ignore_config": True}
+        for _ in range(2 * MOST_STATIONS):
+            with can.Bus(**options) as lonely:  # nobody acknowledges its frame
+                lonely.send(can.Message(arbitration_id=1, is_extended_id=False))
+        with can.Bus(**options) as stays, can.Bus(**options) as hears:
+            for number in range(2 * MOST_STATIONS):
+                with can.Bus(**options) as opened:
+                    stays.send(can.Message(arbitration_id=2, is_extended_id=False, data=bytes((number,))))
+                    clock.sleep(0.001)
+                    heard = [opened.recv(0.0) for _ in range(2)]
+                    assert [message and message.data[0] for message in heard] == [number, None]
+                    stays.send(can.Message(arbitration_id=2, is_extended_id=False, data=b"\xff"))
+                clock.sleep(0.001)
+            assert stays.recv(0.01) is None
+            assert sum(hears.recv(0.01) is not None for _ in range(5 * MOST_STATIONS)) == 4 * MOST_STATIONS
+        with ExitStack() as all_open:
+            for _ in range(MOST_STATIONS):
+                all_open.enter_context(can.Bus(**options))
+            with pytest.raises(can.CanInitializationError, match="more than 64 endpoints at the same time"):
+                can.Bus(**options)
 
 
 def test_an_event_loop_waits_in_virtual_time() -> None:

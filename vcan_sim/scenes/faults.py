@@ -42,9 +42,11 @@ def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
     for late in found:
         _check_alone(scene, late, found[: late.number])
         try:
-            _check_together(schedule, late, hand, shapes)
+            _check_together(schedule, late, late.from_s, hand, shapes)
         except ConfigError as error:
             raise _with_place(scene, late.number, error) from None
+    for early in found:
+        _check_end(scene, schedule, early, hand, shapes)
     return schedule
 
 
@@ -88,20 +90,42 @@ def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]
 
 
 def _check_together(
-    schedule: FaultSchedule, late: TimedFault, hand: HandConfig, shapes: dict[str, tuple[int, int]]
+    schedule: FaultSchedule,
+    fault: TimedFault,
+    t_s: float,
+    hand: HandConfig,
+    shapes: dict[str, tuple[int, int]],
 ) -> None:
-    """Raise ConfigError if a fault contradicts other faults that are active when it starts."""
+    """Raise ConfigError if the faults active at ``t_s`` at the place of ``fault`` contradict each other."""
     values: dict[str, Any] = {}
-    for each in schedule.active(late.from_s):
-        if (each.place, each.on_bus) == (late.place, late.on_bus):
+    for each in schedule.active(t_s):
+        if (each.place, each.on_bus) == (fault.place, fault.on_bus):
             values |= each.values
-    if late.on_bus:
-        check_bus(dataclasses.replace(NO_BUS_FAULTS, **values), hand.bus(late.place))
+    if fault.on_bus:
+        check_bus(dataclasses.replace(NO_BUS_FAULTS, **values), hand.bus(fault.place))
         return
     faults = dataclasses.replace(NO_FAULTS, **values)
-    if late.place not in shapes:
-        shapes[late.place] = next(p for p in hand.patches if p.name == late.place).layout.build().shape
-    check_wires(faults, late.place, shapes[late.place])
+    if fault.place not in shapes:
+        shapes[fault.place] = next(p for p in hand.patches if p.name == fault.place).layout.build().shape
+    check_wires(faults, fault.place, shapes[fault.place])
+
+
+def _check_end(
+    scene: SceneConfig,
+    schedule: FaultSchedule,
+    early: TimedFault,
+    hand: HandConfig,
+    shapes: dict[str, tuple[int, int]],
+) -> None:
+    """Raise ConfigError if the faults that remain when ``early`` ends are invalid without it."""
+    if early.to_s == math.inf:
+        return
+    try:
+        _check_together(schedule, early, early.to_s, hand, shapes)
+    except ConfigError as error:
+        key = f"faults[{early.number}].to_s"
+        allowed = f"a time at which the remaining faults are valid; {error.key} needs {error.allowed}"
+        raise ConfigError(key, early.to_s, allowed, where=scene.where(key)) from None
 
 
 def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:

@@ -11,6 +11,7 @@ from skinnode.files.whole_file import discard
 from skinnode.messages.definitions import CAN_FRAME, FD_FRAME, JOURNAL_LINE
 from skinnode.messages.fields import POINT_CLOUD
 from skinnode.messages.typestore import decode, encode, message_type, require_mcap
+from skinnode.record.journal import repaired_line
 from skinnode.record.mcap_file import CHUNK_BYTES, PROFILE
 from skinnode.transport.frame_log import create_binary
 
@@ -99,6 +100,5 @@ def _ends(data: bytes) -> bool:
 
 def _add_repaired(writer: Writer, channel: int, last: Message, *, frames: int, damaged: int) -> None:
     """Write the journal line that marks a repaired recording; ``last`` is the preceding line."""
-    event = {"bus": "", "at": 0, "t_ns": 0, "event": "repaired", "frames": frames, "damaged": damaged}
-    data = encode(message_type(JOURNAL_LINE)(json.dumps(event)), JOURNAL_LINE)
+    data = encode(message_type(JOURNAL_LINE)(repaired_line(frames, damaged)), JOURNAL_LINE)
     writer.add_message(channel, last.log_time, data, last.publish_time, (last.sequence + 1) & 0xFFFF_FFFF)

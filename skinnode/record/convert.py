@@ -70,7 +70,8 @@ def convert(
         source: Existing file.
         target: New file.
         hand: Hand for a log without a journal; see :func:`skinnode.record.open_recording.open_log`.
-        frames_only: Whether to omit the fields from an MCAP file.
+        frames_only: Whether to omit the fields from an MCAP file. If the source is also an MCAP file, its
+            contacts, poses, health and events are omitted, too.
 
     Raises:
         ConfigError: The source cannot be read, the target exists or cannot be written, the conversion is not
@@ -81,7 +82,7 @@ def convert(
     if source.suffix in TABLES:
         return _copy_table(source, target)
     if source.suffix == target.suffix == MCAP and hand is None:
-        return _copy_mcap(source, target)
+        return _copy_mcap(source, target, frames_only=frames_only)
     recording = open_recording(source) if hand is None else open_log(source, hand)
     with closing(recording.frames):
         if target.suffix in TABLES:
@@ -121,9 +122,10 @@ def ending_in(suffixes: tuple[str, ...]) -> str:
     return f"a file ending in {', '.join(suffixes[:-1])} or {suffixes[-1]}"
 
 
-def _copy_mcap(source: Path, target: Path) -> Conversion:
-    frames, fields, faults = copy_mcap(source, target)
-    return Conversion(frames, fields, tuple(faults), ())
+def _copy_mcap(source: Path, target: Path, *, frames_only: bool) -> Conversion:
+    frames, fields, faults = copy_mcap(source, target, frames_only=frames_only)
+    notes = (f"{target.name} contains only the frames and the journal",) if frames_only else ()
+    return Conversion(frames, fields, tuple(faults), notes)
 
 
 def _copy_table(source: Path, target: Path) -> Conversion:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import json
 import random
 import signal
 import struct
@@ -497,6 +498,18 @@ def test_a_repaired_recording_is_whole_and_says_that_it_was_repaired(tmp_path: P
         assert bits(played) == wanted
         assert (played.flaws, len(wanted) > 20) == ([], True)
         assert [note for note in played.notes if "was repaired" in note]
+
+
+def test_a_copy_with_frames_only_has_no_messages_of_another_kind(tmp_path: Path, run: Any) -> None:
+    path, small = run[0], tmp_path / "small.mcap"
+    done = CliRunner().invoke(app, ["convert", str(path), str(small), "--frames-only", "--json"])
+    assert done.exit_code == 0, done.output
+    with small.open("rb") as file:
+        kinds = Counter(schema.name for schema, _, _ in make_reader(file).iter_messages() if schema)
+    assert set(kinds) == {"can_msgs/msg/Frame", JOURNAL_LINE}
+    assert json.loads(done.stdout)["frames"] == kinds["can_msgs/msg/Frame"] > 500
+    assert json.loads(done.stdout)["fields"] == 0
+    assert bits(replay(small)) == bits(replay(path))
 
 
 def test_a_repaired_recording_knows_that_a_part_is_missing_inside(tmp_path: Path, run: Any) -> None:

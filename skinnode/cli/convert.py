@@ -42,7 +42,7 @@ def convert(
         ),
     ] = None,
     frames_only: Annotated[
-        bool, typer.Option("--frames-only", help="Do not compute the fields for an MCAP file.")
+        bool, typer.Option("--frames-only", help="Write only the frames and the journal to an MCAP file.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
 ) -> None:

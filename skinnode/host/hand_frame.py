@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Final
 
 from skinnode.config import HandConfig
+from skinnode.errors import SkinError
 from skinnode.host.health import SCANS_MISSED, Condition
 from skinnode.host.publish import Subscription, check_timeout
 from skinnode.host.skeleton import Skeleton
@@ -24,7 +25,7 @@ from skinnode.process import clock
 from skinnode.process.closing import Closing
 
 LATE: Final = "late"
-"""Reason for a missing field: the patch is operational, but its field missed the deadline."""
+"""Reason for a missing field: the patch is operational, but its field missed the deadline or the end."""
 OVERTAKEN: Final = "overtaken"
 """Reason for a missing field: the patch has already delivered the field of a newer scan."""
 
@@ -202,6 +203,13 @@ class HandGatherer:
         number = min(self._open)
         if now_ns < self._until_ns[number] and any(self._awaited(patch, number) for patch in self._patches):
             return None
+        return self._given(number)
+
+    def rest(self) -> HandFrame | None:
+        """Return the oldest pending hand frame, ready or not, because no more fields follow; None if none."""
+        return self._given(min(self._open)) if self._open else None
+
+    def _given(self, number: _Number) -> HandFrame:
         fields = self._open.pop(number)
         del self._until_ns[number]
         self._newest_given = number
@@ -231,7 +239,8 @@ class HandSubscription(Closing):
     """Subscription to hand frames. Read it with ``for``, ``async for`` or :meth:`get`.
 
     A slow reader loses the oldest fields and gets hand frames with missing fields. ``dropped`` counts the
-    lost fields. Only one thread may read a subscription.
+    lost fields. At the end, pending hand frames are delivered with the fields that have arrived. Only one
+    thread may read a subscription.
     """
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:
@@ -299,9 +308,15 @@ class HandSubscription(Closing):
                     if end_ns is not None and clock.monotonic_ns() >= end_ns:
                         raise self._too_long() from None
                     continue
+                except SkinError as error:
+                    frame = self._at_end(error)
+                    break
                 if field is None:
-                    return
+                    frame = self._at_end()
+                    break
                 self._gatherer.add(field, clock.monotonic_ns())
+            if frame is None:
+                return
             yield frame
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
@@ -315,9 +330,18 @@ class HandSubscription(Closing):
                 if end_ns is not None and clock.monotonic_ns() >= end_ns:
                     raise
                 continue
+            except SkinError as error:
+                return self._at_end(error)
             if field is None:
-                return None
+                return self._at_end()
             self._gatherer.add(field, clock.monotonic_ns())
+        return frame
+
+    def _at_end(self, error: SkinError | None = None) -> HandFrame | None:
+        """Return the oldest pending hand frame; if there is none, raise ``error`` or return None."""
+        frame = self._gatherer.rest()
+        if frame is None and error is not None:
+            raise error
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:

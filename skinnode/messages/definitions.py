@@ -109,12 +109,13 @@ skinnode_msgs/Contact[] contacts
 """,
     FIELD: """\
 # Displacement field of a patch in double precision, complete. Published only over a network.
-uint16 VERSION=1
+uint16 VERSION=2
 skinnode_msgs/FieldInfo info
 int64 started_ns         # time since 1970 at which the publisher started, ns; identifies its run
 uint64 sequence          # number of the field of this patch in this run, from 1; a gap is a lost field
 int64 sent_ns            # time since 1970 at which the publisher sent the field, ns
 int64 wall_minus_mono_ns # time since 1970 minus the monotonic clock of the host, ns
+uint32 layout_hash       # identifies the layout with which the field was computed
 uint32 upper_wires
 uint32 electrodes        # per upper wire
 float64[] displacement   # (upper wire, electrode, axis), m, as all arrays below

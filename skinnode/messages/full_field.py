@@ -22,7 +22,7 @@ _NOTHING = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SendStamp:
-    """Sequence number and times of a field that is sent to other processes."""
+    """Sequence number, times and layout of a field that is sent to other processes."""
 
     started_ns: int
     """Unix time (ns) at which the publisher started; identifies the publisher's run."""
@@ -32,6 +32,8 @@ class SendStamp:
     """Unix time (ns) at which the field was sent."""
     wall_minus_mono_ns: int
     """Unix time minus the host's monotonic clock, in ns."""
+    layout_hash: int = 0
+    """Hash of the layout with which the field was computed (:attr:`skinnode.PatchLayout.layout_hash`)."""
 
 
 def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:
@@ -39,7 +41,7 @@ def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:
 
     Args:
         field: The field, with a stamp.
-        sent: Sequence number and times of the field.
+        sent: Sequence number, times and layout of the field.
     """
     stamp = field.stamp
     assert stamp is not None
@@ -51,6 +53,7 @@ def encode_field(field: FieldFrame, sent: SendStamp) -> bytes:
         sequence=sent.sequence,
         sent_ns=sent.sent_ns,
         wall_minus_mono_ns=sent.wall_minus_mono_ns,
+        layout_hash=sent.layout_hash,
         upper_wires=field.displacement_m.shape[0],
         electrodes=field.displacement_m.shape[1],
         displacement=_flat(field.displacement_m),
@@ -107,7 +110,13 @@ def decode_field(data: bytes) -> tuple[FieldFrame, SendStamp]:
         touch_odds=None if np.isnan(info.touch_odds) else info.touch_odds,
         faults=tuple(map(_fault, info.faults)),
     )
-    sent = SendStamp(message.started_ns, message.sequence, message.sent_ns, message.wall_minus_mono_ns)
+    sent = SendStamp(
+        message.started_ns,
+        message.sequence,
+        message.sent_ns,
+        message.wall_minus_mono_ns,
+        message.layout_hash,
+    )
     return sealed(field), sent
 
 

@@ -20,7 +20,7 @@ from skinnode.model.frames import FieldFrame, ResistanceFrame
 from skinnode.model.layout import Float
 from skinnode.record.copy_mcap import copy_mcap
 from skinnode.record.field_rows import FieldRow, row_of
-from skinnode.record.journal import journal_of, new_journal_of
+from skinnode.record.journal import journal_of, new_journal_of, repaired_line
 from skinnode.record.keeping_solver import KeepingSolver
 from skinnode.record.log_files import LogFiles
 from skinnode.record.mcap_file import MCAP, McapFile
@@ -70,7 +70,8 @@ def convert(
         source: Existing file.
         target: New file.
         hand: Hand for a log without a journal; see :func:`skinnode.record.open_recording.open_log`.
-        frames_only: Whether to omit the fields from an MCAP file.
+        frames_only: Whether to omit the fields from an MCAP file. If the source is also an MCAP file, its
+            contacts, poses, health and events are omitted, too.
 
     Raises:
         ConfigError: The source cannot be read, the target exists or cannot be written, the conversion is not
@@ -81,7 +82,7 @@ def convert(
     if source.suffix in TABLES:
         return _copy_table(source, target)
     if source.suffix == target.suffix == MCAP and hand is None:
-        return _copy_mcap(source, target)
+        return _copy_mcap(source, target, frames_only=frames_only)
     recording = open_recording(source) if hand is None else open_log(source, hand)
     with closing(recording.frames):
         if target.suffix in TABLES:
@@ -121,9 +122,10 @@ def ending_in(suffixes: tuple[str, ...]) -> str:
     return f"a file ending in {', '.join(suffixes[:-1])} or {suffixes[-1]}"
 
 
-def _copy_mcap(source: Path, target: Path) -> Conversion:
-    frames, fields, faults = copy_mcap(source, target)
-    return Conversion(frames, fields, tuple(faults), ())
+def _copy_mcap(source: Path, target: Path, *, frames_only: bool) -> Conversion:
+    frames, fields, faults = copy_mcap(source, target, frames_only=frames_only)
+    notes = (f"{target.name} contains only the frames and the journal",) if frames_only else ()
+    return Conversion(frames, fields, tuple(faults), notes)
 
 
 def _copy_table(source: Path, target: Path) -> Conversion:
@@ -182,6 +184,7 @@ def _copy_frames(recording: OpenRecording, target: Path, *, fields: bool) -> Con
         else:
             for _ in run.frames():
                 pass
+        tee.mark_damage()
     written = file.fields if isinstance(file, McapFile) else 0
     return Conversion(file.frames, written, tuple(run.flaws), (*run.notes, *_losses(recording, target, tee)))
 
@@ -217,6 +220,9 @@ class CopiedFrames:
         self.path = recording.frames.path
         self.errors = 0
         """Number of error frames."""
+        self._lines = recording.lines
+        self._damaged = 0  # damaged parts before the newest frame
+        self._newest_ns = 0
 
     @property
     def damages(self) -> list[Damage]:
@@ -228,6 +234,7 @@ class CopiedFrames:
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         for number, logged in enumerate(self._frames, 1):
+            self._damaged, self._newest_ns = self._frames.damaged, logged.frame.t_ns
             frame, bus = logged.frame, self._channels.bus(logged.channel)
             if bus is not None:
                 self._file.write(bus, frame, sent=logged.sent, log_ns=frame.t_ns)
@@ -235,6 +242,18 @@ class CopiedFrames:
             if number % _FLUSH_FRAMES == 0:
                 self._file.flush(to_disk=False)
             yield logged
+
+    def mark_damage(self) -> None:
+        """If frames before the last one were lost, write to the journal that this is a repaired recording.
+
+        The frame counts in the journal do not match such a copy. A log that would share the journal of the
+        source gets its own journal.
+        """
+        if not (self._damaged and self._lines):
+            return
+        if isinstance(self._file, LogFiles):
+            self._file.begin_journal(self._lines)
+        self._file.write_line(repaired_line(self._file.frames, self._damaged), self._newest_ns)
 
     def close(self) -> None:
         self._frames.close()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 from skinnode.files.whole_file import discard
 from skinnode.messages.definitions import CAN_FRAME, FD_FRAME, JOURNAL_LINE
 from skinnode.messages.fields import POINT_CLOUD
 from skinnode.messages.typestore import decode, encode, message_type, require_mcap
+from skinnode.record.journal import repaired_line
 from skinnode.record.mcap_file import CHUNK_BYTES, PROFILE
 from skinnode.transport.frame_log import create_binary
 
@@ -21,11 +22,20 @@ if TYPE_CHECKING:
     from skinnode.record.mcap_chunks import McapChunks
 
 
-def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
+_FRAMES: Final = (CAN_FRAME, FD_FRAME, JOURNAL_LINE)
+"""Schemas of a recording without fields."""
+
+
+def copy_mcap(source: Path, target: Path, *, frames_only: bool = False) -> tuple[int, int, list[str]]:
     """Copy every readable message, including its times, topic and schema.
 
     If the source is a recording that is damaged or was not closed properly, this is noted in the journal of
     the copy.
+
+    Args:
+        source: Existing file.
+        target: New file.
+        frames_only: Whether to copy only the CAN frames and the journal.
 
     Returns:
         Numbers of CAN frames and fields copied, and a one-line message for each damaged part.
@@ -41,7 +51,7 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
     file = create_binary(target)
     try:
         with file:
-            counts = _copy(chunks, file)
+            counts = _copy(chunks, file, _FRAMES if frames_only else None)
     except BaseException:
         discard(target)
         raise
@@ -52,8 +62,8 @@ def copy_mcap(source: Path, target: Path) -> tuple[int, int, list[str]]:
     return frames, counts.get(POINT_CLOUD, 0), faults
 
 
-def _copy(chunks: McapChunks, file: BinaryIO) -> dict[str, int]:
-    """Copy the readable messages; return the number of messages of each schema."""
+def _copy(chunks: McapChunks, file: BinaryIO, names: tuple[str, ...] | None) -> dict[str, int]:
+    """Copy the readable messages of the given schemas; return the number of messages of each schema."""
     from mcap.writer import CompressionType, Writer
 
     from skinnode.record.mcap_chunks import TRUNCATED
@@ -65,7 +75,7 @@ def _copy(chunks: McapChunks, file: BinaryIO) -> dict[str, int]:
     channels: dict[int, int] = {}
     last: tuple[int, Message] | None = None  # newest journal line and its channel in the copy
     ended = False
-    for item in chunks.messages(None):
+    for item in chunks.messages(names):
         channel, message, schema = item.channel, item.message, item.schema
         if channel.id not in channels:
             if schema is not None and schema.id not in schemas:
@@ -99,6 +109,5 @@ def _ends(data: bytes) -> bool:
 
 def _add_repaired(writer: Writer, channel: int, last: Message, *, frames: int, damaged: int) -> None:
     """Write the journal line that marks a repaired recording; ``last`` is the preceding line."""
-    event = {"bus": "", "at": 0, "t_ns": 0, "event": "repaired", "frames": frames, "damaged": damaged}
-    data = encode(message_type(JOURNAL_LINE)(json.dumps(event)), JOURNAL_LINE)
+    data = encode(message_type(JOURNAL_LINE)(repaired_line(frames, damaged)), JOURNAL_LINE)
     writer.add_message(channel, last.log_time, data, last.publish_time, (last.sequence + 1) & 0xFFFF_FFFF)

@@ -188,6 +188,17 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     )
 
 
+def repaired_line(frames: int, damaged: int) -> str:
+    """Return the journal line that marks a copy of a damaged recording.
+
+    Args:
+        frames: Number of frames in the copy.
+        damaged: Number of unreadable parts before the end of the recording.
+    """
+    event = {"bus": "", "at": 0, "t_ns": 0, "event": "repaired", "frames": frames, "damaged": damaged}
+    return json.dumps(event)
+
+
 def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str], list[bytes]]:
     """Read a journal.
 

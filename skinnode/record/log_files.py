@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable
 from itertools import count
 from pathlib import Path
 
@@ -54,6 +55,18 @@ class LogFiles:
         """Write a journal line."""
         if self._journal is not None:
             self._journal.write(line + "\n")
+
+    def begin_journal(self, lines: Iterable[str]) -> None:
+        """Give a log without a journal its own journal, which begins with ``lines``.
+
+        If a journal exists already, nothing changes.
+
+        Raises:
+            ConfigError: The journal cannot be created.
+        """
+        if self._journal is None:
+            self._journal = create(self._journal_path)
+            self._journal.writelines(line + "\n" for line in lines)
 
     def flush(self, *, to_disk: bool) -> None:
         """Flush the journal before the log, so that the journal on disk is never older than the log."""

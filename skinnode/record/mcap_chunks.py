@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import mmap
 import struct
+import zlib
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import BinaryIO, Final
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from skinnode.errors import ConfigError
@@ -26,6 +27,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 
 _HEAD: Final = struct.Struct("<BQ")  # opcode and length of each record
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # two times, size, checksum, length of the compression name
+_FOOT: Final = struct.Struct("<BQQQI")  # opcode, length, two offsets, checksum of the index before it
 _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _MOST_CHUNK: Final = 1 << 26
 """Maximum uncompressed chunk size in bytes; the usual size is 1 MiB. A larger size indicates damage."""
@@ -69,8 +71,8 @@ class McapChunks:
 
         Args:
             names: Schema names; None for all messages.
-            by_index: Whether to skip chunks whose index lists no such message. The first message on each
-                topic must then be in the chunk that defines the topic.
+            by_index: Whether to skip chunks that contain no such message according to the index at the end of
+                the file. The first message on each topic must then be in the chunk that defines the topic.
         """
 
         def wanted(channel: int) -> bool:
@@ -109,11 +111,11 @@ class McapChunks:
         follows.
         """
         at, size = len(MAGIC), len(data)
+        indexes = {} if wanted is None else _chunk_indexes(data)
         while at < size:
             opcode, end = data[at], _end_of(data, at)
             if opcode == Opcode.CHUNK and end is not None:
-                index = None if wanted is None else _indexed(data, end)
-                if wanted is not None and index is not None and not any(map(wanted, index)):
+                if wanted is not None and _can_skip(indexes.get(at), end - at, wanted):
                     at = end
                     continue
                 content = self._read(data, at, end)
@@ -195,15 +197,35 @@ def _is_plausible(data: mmap.mmap, at: int) -> bool:
     return at == len(data) or _end_of(data, at) is not None
 
 
-def _indexed(data: mmap.mmap, at: int) -> frozenset[int] | None:
-    """Return the channel numbers in the message indexes after a chunk; None if there are no indexes."""
-    found = set()
-    while (end := _end_of(data, at)) is not None and data[at] == Opcode.MESSAGE_INDEX:
-        if end < at + _HEAD.size + 2:
-            return None
-        found.add(int.from_bytes(data[at + _HEAD.size : at + _HEAD.size + 2], "little"))
-        at = end
-    return frozenset(found) or None
+def _can_skip(index: ChunkIndex | None, length: int, wanted: Callable[[int], bool]) -> bool:
+    """Return whether a chunk's entry in the index shows that it contains no wanted message."""
+    if index is None or index.chunk_length != length or not index.message_index_offsets:
+        return False
+    return not any(map(wanted, index.message_index_offsets))
+
+
+def _chunk_indexes(data: mmap.mmap) -> dict[int, ChunkIndex]:
+    """Return the entries of the index at the end of the file, by the offsets of their chunks.
+
+    Only this index has a checksum. If it is missing or damaged, the result is empty.
+    """
+    foot = len(data) - _FOOT.size - len(MAGIC)
+    if foot < len(MAGIC) or data[foot + _FOOT.size :] != MAGIC:
+        return {}
+    opcode, _, at, _, checksum = _FOOT.unpack_from(data, foot)
+    summed = data[at : foot + _FOOT.size - 4]
+    if opcode != Opcode.FOOTER or not 0 < at < foot or zlib.crc32(summed) != checksum:
+        return {}
+    found = {}
+    try:
+        while at < foot and (end := _end_of(data, at)) is not None:
+            if data[at] == Opcode.CHUNK_INDEX:
+                index = ChunkIndex.read(ReadDataStream(io.BytesIO(data[at + _HEAD.size : end])))
+                found[index.chunk_start_offset] = index
+            at = end
+    except Exception:  # a wrong index with a correct checksum; the library raises various exceptions
+        return {}
+    return found
 
 
 def _find_chunk(data: mmap.mmap, at: int) -> int:

@@ -161,10 +161,7 @@ class Replay:
         fields = self._publisher.subscribe(64, None, None)
         for frame, channel, sent in self.frames():
             name = self._channels.bus(channel)
-            if name is None:
-                self.strange += 1
-                continue
-            if name not in self._buses:
+            if name is None or name not in self._buses:
                 continue
             self._buses[name].take(
                 frame, sent=sent, whole=not (self.log.damaged or self.foreign or self._lacking)
@@ -193,6 +190,7 @@ class Replay:
             self._read += 1
             if self._first_ns is None:
                 self._first_ns = frame.t_ns
+            self.strange += self._channels.bus(logged.channel) is None
             yield logged._replace(frame=frame)
         self.log.close()
         if not self.stopped:

@@ -45,12 +45,14 @@ def connect(
         port: First port of the daemons on this machine.
 
     Raises:
-        ConfigError: if no such hand is published in time, the router does not answer, an option is invalid,
-            or a package is missing.
+        ConfigError: if no such hand is published in time, the router does not answer, the name or an option
+            is invalid, or a package is missing.
         SkinError: if the daemon does not describe the hand in time, or runs a different version of skinnode.
         ValueError: if ``timeout_s`` is out of range.
     """
     check_timeout(timeout_s)
+    if not hand.isprintable() or not hand.strip():  # no hand file contains such a name, and no key can
+        raise ConfigError("hand", hand, "the name of a hand: printable characters, not all blank")
     require_zenoh("connect")
     options = SessionOptions(router, None, None if config is None else Path(config), port)
     end_s = None if timeout_s is None else clock.monotonic() + timeout_s

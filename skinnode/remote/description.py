@@ -31,12 +31,12 @@ _VERSIONS: Final = {name: version_of(DEFINITIONS[name]) or 0 for name in (FIELD,
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """Facts about a published hand that do not change while it runs."""
+    """Facts about a published hand. While it runs, only layouts that nodes supply can change."""
 
     hand: HandConfig
     """Configuration of the hand, without file names; programs always receive ``guest_sends`` as ``sdo``."""
     layouts: Mapping[str, PatchLayout]
-    """Electrode layout of each patch, by patch name."""
+    """Electrode layout of each patch, by patch name; as planned until its node has supplied its own."""
     boot_id: str
     """Boot ID of the daemon's operating system. Processes with the same boot ID share a monotonic clock."""
     commands: bool
@@ -45,11 +45,18 @@ class Description:
     """Unix time at which the daemon started, in ns; identifies the daemon's run in its fields and reports."""
 
     def agrees_with(self, other: Description) -> bool:
-        """Return whether both descriptions have the same configuration and the same electrodes."""
-        hashes, others = (
-            {name: layout.layout_hash for name, layout in each.layouts.items()} for each in (self, other)
-        )
-        return hashes == others and self.hand.model_dump() == other.hand.model_dump()
+        """Return whether both descriptions have the same configuration and the same electrodes.
+
+        Electrodes that the nodes supply may differ, because they are unknown before a node has appeared.
+        """
+        if self.hand.model_dump() != other.hand.model_dump() or self.layouts.keys() != other.layouts.keys():
+            return False
+        planned = [patch.name for patch in self.hand.patches if patch.layout.coordinates != "node"]
+        return all(self.layouts[name].layout_hash == other.layouts[name].layout_hash for name in planned)
+
+    def hashes(self) -> dict[str, int]:
+        """Return the hash of each patch's layout, by patch name."""
+        return {name: layout.layout_hash for name, layout in self.layouts.items()}
 
     def encode(self) -> bytes:
         """Encode the description as JSON."""

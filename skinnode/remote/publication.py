@@ -18,6 +18,7 @@ from skinnode.messages.full_field import SendStamp, encode_field
 from skinnode.messages.topics import HandTopics
 from skinnode.messages.typestore import encode
 from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import PatchLayout
 from skinnode.process import clock
 from skinnode.process.closing import Closing
 from skinnode.remote import keys
@@ -69,7 +70,7 @@ class Publication(Closing):
         self._patches = [patch.name for patch in host.hand.patches]
         self._published = dict.fromkeys(self._patches, 0)
         self._defects = Defects("publication")
-        self._rest_m = {name: host.layout(name).upper_m for name in self._patches}
+        self._hashed = {name: _hashed(host.layout(name)) for name in self._patches}
         self._outputs = Outputs(self._session, HandTopics.of(host.hand))
         self._fields = host.fields(capacity=QUEUED * len(self._patches))
         self._over = clock.event()
@@ -96,15 +97,15 @@ class Publication(Closing):
             description.undeclare()
 
     def _describe(self, *, commands: bool) -> zenoh.Queryable[None]:
-        """Answer queries for the hand's description."""
-        hand = self._host.hand
-        layouts = {name: self._host.layout(name) for name in self._patches}
-        description = Description(hand, layouts, boot_id(), commands, self._started_ns)
-        key, data = keys.description_key(hand.name), description.encode()
+        """Answer queries for the hand's description with the layouts that are in use at that time."""
+        hand, boot = self._host.hand, boot_id()
+        key = keys.description_key(hand.name)
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                query.reply(key, data)
+                layouts = {name: self._host.layout(name) for name in self._patches}
+                description = Description(hand, layouts, boot, commands, self._started_ns)
+                query.reply(key, description.encode())
 
         return self._session.declare_queryable(key, answer)
 
@@ -134,13 +135,14 @@ class Publication(Closing):
             return
         name, now_ns, offset_ns = stamp.patch, clock.time_ns(), self._status.wall_minus_mono_ns
         self._published[name] += 1
-        sent = SendStamp(self._started_ns, self._published[name], now_ns, offset_ns)
+        layout, layout_hash = self._layout(name)
+        sent = SendStamp(self._started_ns, self._published[name], now_ns, offset_ns, layout_hash)
         outputs, wanted = self._outputs.patches[name], self._outputs.wanted
         if (name, "full_field") in wanted:
             outputs["full_field"].send(encode_field(field, sent), now_ns)
         t_ns = (stamp.t_sync_ns or stamp.t_receive_ns) + offset_ns
         if (name, "field") in wanted:
-            cloud = point_cloud(field, self._rest_m[name], t_ns)
+            cloud = point_cloud(field, layout.upper_m, t_ns)
             outputs["field"].send(encode(cloud, POINT_CLOUD), now_ns)
         if (name, "field_info") in wanted:
             outputs["field_info"].send(encode(field_info(field, t_ns), FIELD_INFO), now_ns)
@@ -149,6 +151,17 @@ class Publication(Closing):
         if (name, "contact_wrenches") in wanted:
             for wrench in contact_wrenches(field, t_ns):
                 outputs["contact_wrenches"].send(encode(wrench, WRENCH), now_ns)
+
+    def _layout(self, name: str) -> tuple[PatchLayout, int]:
+        """Return a patch's current layout and its hash; a node that appears may supply another layout."""
+        layout = self._host.layout(name)
+        if layout is not self._hashed[name][0]:
+            self._hashed[name] = _hashed(layout)
+        return self._hashed[name]
+
+
+def _hashed(layout: PatchLayout) -> tuple[PatchLayout, int]:
+    return layout, layout.layout_hash
 
 
 @contextlib.contextmanager

@@ -74,6 +74,7 @@ class RemoteHand(RunningHand, Closing):
         self._defects = defects = Defects(f"hand {hand.name!r}")
         super().__init__(hand, Publisher(names, defects), Events(defects), Callbacks(defects))
         self._session, self._description = session, description
+        self._hashes = description.hashes()
         self._accounts = {name: PatchAccount() for name in names}
         self._report: HealthReport | None = None
         self._t_report_ns = clock.monotonic_ns()
@@ -209,7 +210,7 @@ class RemoteHand(RunningHand, Closing):
     def _on_field(self, field: FieldFrame, sent: SendStamp, delay_ns: int) -> None:
         stamp = field.stamp
         assert stamp is not None
-        if not self._is_current(sent.started_ns):
+        if not (self._is_current(sent.started_ns) and self._has_layout(stamp.patch, sent)):
             return
         if self._accounts[stamp.patch].add(sent, delay_ns, stamp.t_receive_ns):
             self._publisher.publish(field, stamp.patch)
@@ -233,15 +234,8 @@ class RemoteHand(RunningHand, Closing):
         if self._refusal is not None:
             return
         arrivals = self._watch.arrivals
-        if arrivals != self._described:
-            try:
-                description = ask(self._session, self.hand.name)
-            except SkinError as error:
-                self._refuse(error)
-                return
-            if description is not None:  # otherwise the daemon is starting: ask again
-                self._described = arrivals
-                self._take(description)
+        if arrivals != self._described and self._ask():  # if not described, the daemon is starting: ask again
+            self._described = arrivals
         away = self.away
         if self._report is None or (away is not None) == bool(self._was_away):
             return
@@ -249,13 +243,34 @@ class RemoteHand(RunningHand, Closing):
         what, text = ("back", "its daemon is back") if away is None else ("away", away)
         self._events.publish(HealthEvent(clock.monotonic_ns(), "host", what, text))
 
+    def _ask(self) -> bool:
+        """Request a description and use it; return whether one has arrived."""
+        try:
+            description = ask(self._session, self.hand.name)
+        except SkinError as error:
+            self._refuse(error)
+            return False
+        if description is not None:
+            self._take(description)
+        return description is not None
+
+    def _has_layout(self, patch: str, sent: SendStamp) -> bool:
+        """Return whether the layout of a field is known; if it has changed, request it first.
+
+        A node that appears while the daemon runs may supply electrodes other than those described before. A
+        field is not passed on before :meth:`layout` returns its layout.
+        """
+        if self._hashes[patch] != sent.layout_hash:
+            self._ask()
+        return (self._hashes[patch], self._description.started_ns) == (sent.layout_hash, sent.started_ns)
+
     def _take(self, description: Description) -> None:
         if not description.agrees_with(self._description):
             text = "its daemon has restarted with another hand file; connect again"
             self._refuse(SkinError(f"hand {self.hand.name!r}: {text}"))
             return
         self._run += description.started_ns != self._description.started_ns
-        self._description = description
+        self._description, self._hashes = description, description.hashes()
         self._receiver.follow(description, self._run)
 
     def _refuse(self, error: SkinError) -> None:

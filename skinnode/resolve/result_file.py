@@ -90,7 +90,8 @@ def _write_mcap(
     opened = recording.opened(hand)
     file = McapFile(path, opened.header.hand)
     summaries: list[SolveSummary] = [parts.summary(key) for key in solved]
-    run = Replay(replace(opened, frames=CopiedFrames(opened, file)))
+    tee = CopiedFrames(opened, file)
+    run = Replay(replace(opened, frames=tee))
     scans = _in_order(solved, parts)
     upcoming = next(scans, None)
 
@@ -105,5 +106,6 @@ def _write_mcap(
         for _ in run.frames():
             write_until(run.place)
         write_until((run.place[0], len(hand.buses)))
+        tee.mark_damage()
     finally:
         file.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import itertools
 import threading
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinnode.config import HandConfig, parse_hand
+from skinnode.errors import SkinError
 from skinnode.host import Condition, HandFrame, Host
 from skinnode.host.hand_frame import LATE, OVERTAKEN, HandGatherer, HandSubscription
 from skinnode.host.publish import Publisher
@@ -115,6 +117,34 @@ def test_closing_a_subscription_ends_its_waiting_reader(read: str) -> None:
     assert not reader.is_alive()
     hands.close()
     assert hands.get() is None
+
+
+@pytest.mark.parametrize("read", ["get", "for", "async for"])
+@pytest.mark.parametrize("error", [None, SkinError("the interface is gone")])
+def test_the_end_loses_no_field(read: str, error: SkinError | None) -> None:
+    publisher = Publisher(("a", "b"))
+    hands = HandSubscription(publisher.subscribe(8, None, None), gatherer("a", "b"), None)
+    for patch, scan in (("a", 1), ("b", 1), ("a", 2), ("a", 3)):
+        publisher.publish(field(patch, scan), patch)
+    publisher.end() if error is None else publisher.fail(error)
+    got: list[HandFrame] = []
+
+    async def follow() -> None:
+        it = aiter(hands)
+        while (one := await anext(it, None)) is not None:
+            got.append(one)
+
+    with contextlib.nullcontext() if error is None else pytest.raises(SkinError, match="interface is gone"):
+        if read == "for":
+            got.extend(hands)
+        elif read == "async for":
+            asyncio.run(follow())
+        else:
+            while (one := hands.get()) is not None:
+                got.append(one)
+    assert [numbers(frame) for frame in got] == [{"a": 1, "b": 1}, {"a": 2}, {"a": 3}]
+    assert [dict(frame.missing) for frame in got] == [{}, {"b": LATE}, {"b": LATE}]
+    assert (hands.dropped, hands.late) == (0, 0)
 
 
 def test_after_the_patience_it_goes_on_and_who_comes_then_is_late() -> None:

@@ -22,7 +22,9 @@ from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.frames import Contact, FieldFrame, ScanStamp, SolveStats
 from skinnode.model.status import Status
 
-SENT = SendStamp(1_790_000_000_000_000_001, 2**40 + 3, 1_790_000_000_123_456_789, 1_700_000_000_000_000_000)
+SENT = SendStamp(
+    1_790_000_000_000_000_001, 2**40 + 3, 1_790_000_000_123_456_789, 1_700_000_000_000_000_000, 2**32 - 5
+)
 STAMP = ScanStamp("palm", 300, 44, 4_294_967_295, 5_000_000_001, 5_010_000_002, 5_011_000_003)
 
 

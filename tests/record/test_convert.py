@@ -242,3 +242,24 @@ def test_a_damaged_source_is_converted_as_far_as_it_is_whole(recorded: Path, tmp
     told = json.loads(done.stdout)
     assert any("truncated" in fault for fault in told["faults"])
     assert told["frames"] == sum(1 for _ in FrameLogReader(source))
+
+
+@pytest.mark.parametrize("target", ["run.blf", "x.log", "x.asc", "x.mcap"])
+def test_the_copy_of_a_damaged_log_gives_the_fields_of_that_log(
+    recorded: Path, tmp_path: Path, target: str
+) -> None:
+    """Frames are lost before the baselines are known: the numbers of frames in the journal no longer hold."""
+    source, copy, beside = tmp_path / "run.log", tmp_path / target, tmp_path / "run.jsonl"
+    lines = recorded.read_bytes().splitlines(keepends=True)
+    lines[1:41] = [b"\0" * 40 + b"\n"]
+    source.write_bytes(b"".join(lines))
+    beside.write_bytes(recorded.with_suffix(".jsonl").read_bytes())
+    wanted = bits(source)
+    assert len(wanted) > 20
+    done = convert(source, copy)
+    assert any("no frame" in fault for fault in done.faults)
+    assert bits(copy) == wanted
+    again = convert(copy, tmp_path / "again.npz")
+    assert any("was repaired" in note for note in again.notes)
+    assert beside.read_bytes() == recorded.with_suffix(".jsonl").read_bytes()
+    assert bits(source) == wanted

@@ -129,6 +129,10 @@ def test_frames_of_another_bus_are_left_out(recorded: Path, tmp_path: Path) -> N
     run = replay(log, hand=hand)
     assert [field.displacement_m.tobytes() for field in run] == wanted
     assert run.strange == len(lines)
+    for target, frames_only in (("x.log", False), ("x.mcap", False), ("y.mcap", True)):
+        done = convert(log, tmp_path / target, hand=hand, frames_only=frames_only)
+        assert done.frames == len(lines)
+        assert done.faults == (f"{len(lines)} frames on channels not used by any bus of the hand",)
 
 
 def test_without_baselines_it_says_so_and_is_close(recorded: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import json
 import random
 import signal
 import struct
@@ -36,6 +37,7 @@ from skinnode.messages.definitions import DEFINITIONS, JOURNAL_LINE
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, Replay, followed, replay
 from skinnode.record.convert import convert
+from skinnode.record.mcap_file import McapFile
 from skinnode.record.mcap_reader import McapReader
 from skinnode.transport.frame import Frame
 from vcan_sim.fleet import Fleet
@@ -497,6 +499,45 @@ def test_a_repaired_recording_is_whole_and_says_that_it_was_repaired(tmp_path: P
         assert bits(played) == wanted
         assert (played.flaws, len(wanted) > 20) == ([], True)
         assert [note for note in played.notes if "was repaired" in note]
+
+
+def test_a_changed_byte_in_an_index_hides_no_line_of_the_journal(tmp_path: Path) -> None:
+    """Message indexes have no checksum; an index that is not believed costs time, not events."""
+    path, hand = tmp_path / "x.mcap", a_hand()
+    file = McapFile(path, hand)
+    lines = [f"line {number}" for number in range(8)]
+    for number, line in enumerate(lines):
+        file.write_line(line, 1000 * number)
+        file.write("can0", Frame(0x185, bytes(8), number), sent=False, log_ns=number)
+        file.flush(to_disk=False)
+        file.write("can0", Frame(0x185, bytes(8), number), sent=False, log_ns=number)
+        file.flush(to_disk=False)
+    file.close()
+    data = path.read_bytes()
+    at, changed = len(b"\x89MCAP0\r\n"), 0
+    while at < len(data) - 8:
+        end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+        for byte in (at, at + 9) if data[at] in (0x07, 0x08) else ():  # message index, chunk index
+            for value in (0, 1, 2, 3):
+                bad = bytearray(data)
+                bad[byte] = value
+                path.write_bytes(bad)
+                assert list(McapReader(path).journal()) == [f"{line}\n".encode() for line in lines]
+                changed += 1
+        at = end
+    assert changed > 100
+
+
+def test_a_copy_with_frames_only_has_no_messages_of_another_kind(tmp_path: Path, run: Any) -> None:
+    path, small = run[0], tmp_path / "small.mcap"
+    done = CliRunner().invoke(app, ["convert", str(path), str(small), "--frames-only", "--json"])
+    assert done.exit_code == 0, done.output
+    with small.open("rb") as file:
+        kinds = Counter(schema.name for schema, _, _ in make_reader(file).iter_messages() if schema)
+    assert set(kinds) == {"can_msgs/msg/Frame", JOURNAL_LINE}
+    assert json.loads(done.stdout)["frames"] == kinds["can_msgs/msg/Frame"] > 500
+    assert json.loads(done.stdout)["fields"] == 0
+    assert bits(replay(small)) == bits(replay(path))
 
 
 def test_a_repaired_recording_knows_that_a_part_is_missing_inside(tmp_path: Path, run: Any) -> None:

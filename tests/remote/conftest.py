@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import pytest
+import zenoh
 
 from skinnode.remote.session import PORTS
 from tests.remote.ports import free_ports
@@ -94,6 +95,21 @@ def run() -> Iterator[Callable[..., Process]]:
 def start(port: int, run: Callable[..., Process]) -> Callable[..., Process]:
     """Start a daemon with a simulated hand; see ``daemon.py``."""
     return lambda **options: run("daemon.py", json.dumps({"port": port, **options}))
+
+
+@pytest.fixture
+def session(port: int) -> Iterator[zenoh.Session]:
+    """A session as any Zenoh program opens it, connected to the first daemon of the machine."""
+    config = zenoh.Config()
+    endpoints = [f"tcp/127.0.0.1:{port}"]
+    for key, value in (
+        ("connect/endpoints", endpoints),
+        ("listen/endpoints", []),
+        ("scouting/multicast/enabled", False),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as opened:
+        yield opened
 
 
 def eventually(happens: Callable[[], Any], within_s: float = PATIENCE_S) -> float:

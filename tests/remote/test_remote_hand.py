@@ -124,6 +124,13 @@ def test_commands(start: Callable[..., Process], port: int) -> None:
         assert hand.stats().events_lost == 0
 
 
+@pytest.mark.parametrize("name", ["", " ", "left\nhand", "\udcff"])
+def test_what_no_hand_can_be_called_is_one_line(name: str, port: int) -> None:
+    with pytest.raises(ConfigError, match="allowed: the name of a hand") as refused:
+        sk.connect(name, port=port, timeout_s=0.0)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_wrong_name_lists_the_hands(start: Callable[..., Process], port: int) -> None:
     with pytest.raises(ConfigError, match=r"hand: got 'left'.*none is published on this machine.*--publish"):
         sk.connect("left", port=port, timeout_s=0.0)

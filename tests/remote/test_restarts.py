@@ -104,3 +104,12 @@ def test_electrodes_that_the_hand_file_does_not_contain_are_compared_too() -> No
     assert one.agrees_with(Description.decode(replace(one, started_ns=2).encode(), "hand"))
     moved = PatchLayout(layout.upper_m + 1e-4, layout.lower_m, layout.resistivity_ohm_per_m, layout.name)
     assert not one.agrees_with(replace(one, layouts={"p0": moved}))
+
+
+def test_electrodes_that_the_node_supplies_may_be_unknown_before_it_appears() -> None:
+    table = {"name": "p0", "node_id": 4, "layout": {**SMALL, "coordinates": "node"}}
+    hand = parse_hand({"buses": [{"name": "can0"}], "patches": [table]})
+    layout = hand.patches[0].layout.build()
+    moved = PatchLayout(layout.upper_m + 1e-4, layout.lower_m, layout.resistivity_ohm_per_m, layout.name)
+    one = Description(hand, {"p0": layout}, "", False, 1)
+    assert one.agrees_with(replace(one, layouts={"p0": moved}))

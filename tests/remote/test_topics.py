@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,21 +24,6 @@ DDS = {
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "tf_static": "tf2_msgs/msg/TFMessage",
 }
-
-
-@pytest.fixture
-def session(port: int) -> Iterator[zenoh.Session]:
-    """A session as any Zenoh program opens it, connected to the first daemon of the machine."""
-    config = zenoh.Config()
-    endpoints = [f"tcp/127.0.0.1:{port}"]
-    for key, value in (
-        ("connect/endpoints", endpoints),
-        ("listen/endpoints", []),
-        ("scouting/multicast/enabled", False),
-    ):
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as opened:
-        yield opened
 
 
 def key_of(topic: str, message: str) -> str:

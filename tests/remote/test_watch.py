@@ -258,6 +258,8 @@ def test_a_daemon_with_another_hand_is_one_line(
             ["--remote", "hand", "--zenoh-config", "/nowhere"],
             "--zenoh-config: got '/nowhere', allowed: a Zen",
         ),
+        (["--remote", ""], "hand: got '', allowed: the name of a hand: printable characters, not all blank"),
+        (["--remote", "\udcff"], "hand: got '\\udcff', allowed: the name of a hand"),
         (["--remote", "hand", "--channel", "can1"], "--channel: got 'can1', allowed: only without --remote"),
         (["--remote", "hand", "--speed", "2"], "--speed: got 2.0, allowed: only with --replay"),
         (

@@ -110,6 +110,22 @@ def test_the_file_is_the_one_that_convert_writes(
     assert result["faults"] == result["notes"] == []
 
 
+def test_the_file_of_a_damaged_recording_is_the_one_that_convert_writes(
+    recording: Path, tmp_path: Path, in_turn: None
+) -> None:
+    """It says that frames are missing, so that events take effect by their times."""
+    bad, wanted = tmp_path / "bad.log", tmp_path / "wanted.mcap"
+    lines = recording.read_bytes().splitlines(keepends=True)
+    lines[len(lines) // 2 : len(lines) // 2 + 60] = [b"garbage\n"]
+    bad.write_bytes(b"".join(lines))
+    bad.with_suffix(".jsonl").write_bytes(recording.with_suffix(".jsonl").read_bytes())
+    convert(bad, wanted)
+    options = ("--format", "mcap", "--processes", 1)
+    (result,) = resolve(bad, "-o", tmp_path / "out", *options, status=1)
+    assert messages_in(result["file"]) == messages_in(wanted)
+    assert any("was repaired" in note for note in convert(wanted, tmp_path / "x.npz").notes)
+
+
 def solved_live(recording: Path, **solver: object) -> dict[tuple[str, int], bytes]:
     """Replay with other options in the journal, as a host with these options would have solved the scans."""
     copy = recording.with_name("changed.log")

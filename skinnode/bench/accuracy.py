@@ -51,6 +51,15 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
     return found
 
 
+def _report(
+    scenes: int, rows: dict[str, Any], requirements_of: Callable[[dict[str, Any]], list[dict[str, Any]]]
+) -> dict[str, Any]:
+    """Return the report of one part: its rows and requirements."""
+    figures = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes} | rows
+    report: dict[str, Any] = plain(figures | {"must": requirements_of(figures)})
+    return report
+
+
 def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
     """Run only the families of loads that the prior does not expect, and return the results.
 
@@ -58,11 +67,7 @@ def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
         scenes: Number of scenes per family, layout and noise level.
         echo: Function that prints a progress line.
     """
-    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
-    figures |= families.run(scenes, echo)
-    figures["must"] = families.requirements(figures)
-    found: dict[str, Any] = plain(figures)
-    return found
+    return _report(scenes, families.run(scenes, echo), families.requirements)
 
 
 def run_past(scenes: int, prior: str, echo: Callable[[str], object]) -> dict[str, Any]:
@@ -73,11 +78,7 @@ def run_past(scenes: int, prior: str, echo: Callable[[str], object]) -> dict[str
         prior: Load prior.
         echo: Function that prints a progress line.
     """
-    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
-    figures |= past.run(scenes, prior, echo)
-    figures["must"] = past.requirements(figures)
-    found: dict[str, Any] = plain(figures)
-    return found
+    return _report(scenes, past.run(scenes, prior, echo), past.requirements)
 
 
 def run_pareto(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
@@ -87,11 +88,7 @@ def run_pareto(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
         scenes: Number of scenes of each family.
         echo: Function that prints a progress line.
     """
-    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
-    figures |= pareto.run(scenes, echo)
-    figures["must"] = pareto.requirements(figures)
-    found: dict[str, Any] = plain(figures)
-    return found
+    return _report(scenes, pareto.run(scenes, echo), pareto.requirements)
 
 
 def run_skew(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
@@ -101,11 +98,7 @@ def run_skew(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
         scenes: Number of scenes for each scan period, row time, speed, noise and method.
         echo: Function that prints a progress line.
     """
-    figures: dict[str, Any] = {"benchmark": "accuracy", "machine": machine(), "scenes": scenes}
-    figures |= skew.run(scenes, echo)
-    figures["must"] = skew.requirements(figures)
-    found: dict[str, Any] = plain(figures)
-    return found
+    return _report(scenes, skew.run(scenes, echo), skew.requirements)
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""A touch during a tare is told from temperature, contact resistance and noise."""
+"""A touch during a tare is distinguished from temperature, contact resistance and noise."""
 
 from __future__ import annotations
 

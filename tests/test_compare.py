@@ -66,6 +66,12 @@ def test_every_time_of_a_report_is_compared() -> None:
             "machine": {"tick_us": 1.0},
             "rows": [{"name": "step", "compiled_us": 2.0, "error": 1e-9}],
             "settings": [{"layout": "aligned", "operators": {"dogleg": [{"runtime_ms": 3.0}]}}],
+            "buses": [{"published_ms": {"p50": 4.0, "p99": 5.0}}],
         }
     )
-    assert times == {"step compiled_us": 2.0, "settings 0 operators dogleg 0 runtime_ms": 3.0}
+    assert times == {
+        "step compiled_us": 2.0,
+        "settings 0 operators dogleg 0 runtime_ms": 3.0,
+        "buses 0 published_ms p50": 4.0,
+        "buses 0 published_ms p99": 5.0,
+    }

@@ -30,8 +30,12 @@ def rows_of(report: Any) -> dict[str, float]:
         if isinstance(part, dict):
             own = " ".join(str(value) for value in part.values() if isinstance(value, str))
             for key, value in part.items():
-                if isinstance(value, (int, float)) and key.split("_")[-1] in ("us", "ms", "µs"):
+                is_time = key.split("_")[-1] in ("us", "ms", "µs")
+                if is_time and isinstance(value, (int, float)):
                     found[f"{own or label} {key}"] = float(value)
+                elif is_time and isinstance(value, dict):  # a distribution: p50, p99, max
+                    for name, quantile in value.items():
+                        found[f"{own or label} {key} {name}"] = float(quantile)
                 else:
                     collect(value, f"{label} {key}".strip())
         elif isinstance(part, list):

@@ -84,7 +84,7 @@ class EstimateOptions:
     hold: bool = True
     deadline_us: float | None = None
     prior: str = "cells"
-    past: str = "off"
+    past: str = "auto"
 
     def __post_init__(self) -> None:
         if self.drift not in DRIFTS:

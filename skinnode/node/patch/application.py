@@ -63,7 +63,9 @@ class PatchApplication:
         self._emcy = services.emcy
         unknown = np.full((profile.rows, profile.columns), acquisition.scale.open, dtype=np.uint32)
         first_chunk = pack_scan(unknown, 0, profile)[0]
-        self.stream = ScanStream(services.store, services.tpdos, first_chunk, pacing.catch_up_ns)
+        self.stream = ScanStream(
+            services.store, services.tpdos, first_chunk, pacing.catch_up_ns, acquisition.selection.forget
+        )
         """Sender of the scans."""
         self._storage = services.storage
         self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
@@ -187,6 +189,7 @@ class PatchApplication:
         """Take a scan and queue it, or skip it if another scan is already waiting."""
         self._counter = counter
         if self.stream.full:
+            self._acquisition.selection.forget()  # receivers notice the gap
             self.overruns += 1
             held_up = self.stream.is_held_up(t_ns)
             self.slow_overruns += held_up

@@ -135,7 +135,8 @@ SKN_API bool skn_find_wire_faults(const skn_code_t *codes, skn_wire_faults_t *fa
 SKN_API void skn_sender_init(skn_sender_t *sender);
 
 /* Make the next scan a full scan. Call this function after a write to the send policy, on entry to OPERATIONAL,
- * and after a converter failure. */
+ * after a converter failure, and after a scan that was skipped or not sent completely: receivers then no longer know
+ * the codes of unsent chunks. */
 SKN_API void skn_sender_full(skn_sender_t *sender);
 
 /* Announce a new baseline in the next summary, and make the next scan a full scan. */

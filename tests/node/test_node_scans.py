@@ -552,6 +552,14 @@ class TestCommandPdo:
         assert operational.frame(0x204, "00 00 00 00 00 07") == []
         assert operational.read(0x2020, 1) == 0
 
+    def test_a_scan_that_the_bus_refuses_does_not_cost_the_mode(self, desk) -> None:
+        desk.start()
+        desk.bus_refuses = True
+        with pytest.raises(BusError):  # whoever drives it hears of it
+            desk.node.on_frame(0x204, bytes.fromhex("00 00 00 00 01 01"), desk.t_ns)
+        desk.bus_refuses = False
+        assert desk.read(0x2020, 1) == 1
+
     def test_too_short_is_told_until_it_is_right(self, operational) -> None:
         desk = operational
         assert desk.frame(0x204, "74 61 72 65 00") == [(EMCY, "10 82 11 01 05 06 00 00")]

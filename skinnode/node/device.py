@@ -260,7 +260,7 @@ class CanopenDevice:
         self._tpdos.restore()
         self._rpdos.restore()
         self._sync.reload()
-        self._application.reset()
+        self._application.reset(everything=objects == EVERYTHING)
         self._reload()
         self._error_control.boot_up(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)

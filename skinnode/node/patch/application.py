@@ -116,11 +116,15 @@ class PatchApplication:
                 self._tare(t_ns)
                 self._storage.keep_baseline()
 
-    def reset(self) -> None:
-        """Restart the scan counter. Persistent faults are reported again."""
+    def reset(self, *, everything: bool) -> None:
+        """Restart the scan counter. Persistent faults are reported again.
+
+        If ``everything`` is true, forget the result of the self-test, too.
+        """
         self._counter, self._late = -1, False
         self._wire_faults.reset()
-        self._test = SELF_TEST_NEVER_RUN
+        if everything:
+            self._test = SELF_TEST_NEVER_RUN
         self.source.reset(self._now())
 
     def enter(self, *, operational: bool) -> None:

@@ -23,8 +23,8 @@ unsent when the window closes. Event-driven TPDOs are not affected.
 the node leaves OPERATIONAL, all scans are dropped without a summary. If the chunk TPDO is disabled,
 the summary states that chunks are missing.
 
-**Lost frames.** If a chunk or a summary cannot be sent, receivers no longer know the codes of unsent chunks, so
-the next scan must be a full scan. This does not apply to chunks that are discarded at the end of the
+**Lost frames.** If a chunk or a summary cannot be sent, receivers no longer know the codes of unsent chunks,
+so the next scan must be a full scan. This does not apply to chunks that are discarded at the end of the
 synchronous window: in a full scan, there would be more of them.
 """
 

@@ -226,7 +226,8 @@ typedef struct {
     uint32_t bad_counter; /* * scan counter outside the range of the SYNC counter */
     uint32_t bad_form;    /* * summaries without a check, although the node sends checks */
     uint32_t resyncs;     /* number of times that the scan counter continued out of sequence after a pause */
-    uint32_t baseline_doubts; /* discarded scans that may have announced a new baseline: read R0 again */
+    uint32_t baseline_doubts; /* discarded scans that may have announced a new baseline. Read R0 again after one of
+                                 these, and after missed scans, lost summaries and resyncs */
 } skn_stats_t;
 
 /* Assembler of the scans of one node. Read `stats`; use the functions for everything else. */

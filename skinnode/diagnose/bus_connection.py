@@ -19,7 +19,11 @@ from skinnode.host.sdo_client import RemoteOd
 from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum wait for a heartbeat, in s. Heartbeats with a longer period are missed."""
+"""Maximum wait for a heartbeat whose period is unknown, in s. Heartbeats with a longer period are missed."""
+
+LONGEST_KNOWN_HEARTBEAT_S: Final = 15.1
+"""Maximum wait for a heartbeat whose period is known, in s. It suffices for the longest period that a hand
+file can set, 10 s."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
 """Maximum times to wait for the responses to the first and the second remote frame, in s.
@@ -176,8 +180,10 @@ class BusConnection(Closing):
             since_ns: Heartbeats received before this time (monotonic clock, ns) are ignored.
         """
         if heartbeat_s != 0:
-            wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1
-            beat = self._beat(node_id, since_ns, min(wait_s, LONGEST_HEARTBEAT_S))
+            wait_s = LONGEST_HEARTBEAT_S
+            if heartbeat_s is not None:
+                wait_s = min(1.5 * heartbeat_s + 0.1, LONGEST_KNOWN_HEARTBEAT_S)
+            beat = self._beat(node_id, since_ns, wait_s)
             if beat is not None:
                 return State(beat.state, "heartbeat")
             if heartbeat_s:

@@ -46,6 +46,15 @@ def test_finds_every_node_with_its_identity(
     assert found.seconds < 3.0
 
 
+def test_a_heartbeat_every_four_seconds_is_waited_for(
+    bus: BusConfig, powered: Powered, connection_on: ConnectionOn
+) -> None:
+    powered(bus, 5)
+    connection_on(bus).od(5).write(od.HEARTBEAT_PRODUCER, 0, "u16", 4000)
+    (found,) = discover(connection_on(bus)).nodes
+    assert (found.state, found.state_known_by) == ("pre-operational", "heartbeat")
+
+
 def test_nodes_without_a_node_id_are_told_apart_and_wait_again(
     bus: BusConfig, powered: Powered, connection_on: ConnectionOn
 ) -> None:

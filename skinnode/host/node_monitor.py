@@ -108,6 +108,7 @@ class NodeMonitor:
         state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
         if state == NmtState.INITIALISING:
             self._boot_ups += 1
+            self.forget_beats()
             self._on_register(0)  # a reset clears the register; the node reports persisting errors again
             if self.running:
                 self._restarts.append(t_ns)
@@ -116,6 +117,10 @@ class NodeMonitor:
             self._beats.append(t_ns)
         self.nmt_state = state
         self._t_heartbeat_ns = t_ns
+
+    def forget_beats(self) -> None:
+        """Forget the heartbeats received so far, because their period may have changed."""
+        self._beats = deque(maxlen=BEATS)  # a new one, because other threads read the old one
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY message.

@@ -103,6 +103,17 @@ def test_a_node_that_somebody_resets_or_stops_runs_again(
         assert host.stats().other_masters["can0"].nmt_commands == 1
 
 
+def test_heartbeats_of_an_earlier_period_are_no_second_node(
+    hand: HandConfig, rack: Rack, listener: CanPort
+) -> None:
+    with Host.from_config(hand) as host:
+        listener.send(0x605, bytes.fromhex("2b 17 10 00 14 00 00 00"))  # a heartbeat every 20 ms
+        assert eventually(lambda: host.health("p0").duplicate_id)  # as often as of many nodes
+        host.reset_node("p0")
+        assert eventually(lambda: host.stats().nodes["p0"].rejoins == 1)  # every 250 ms again
+        assert not host.health("p0").duplicate_id
+
+
 def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, rack: Rack) -> None:
     """After a reset it sends no heartbeat either."""
     with Host.from_config(hand) as host:

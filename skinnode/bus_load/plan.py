@@ -204,11 +204,13 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
     """Return the inhibit time (0x1800:3, unit 100 µs) that makes a scan last SCAN_SHARE of the SYNC period.
 
+    The object is a 16-bit number: if SYNCs are far apart and a scan has few frames, the scan is shorter.
+
     Args:
         period_ms: SYNC period, in ms.
         frames: number of frames in a scan.
     """
-    return int(period_ms * 10 * SCAN_SHARE / frames)
+    return min(int(period_ms * 10 * SCAN_SHARE / frames), 0xFFFF)
 
 
 def _profile(hand: HandConfig, i: int, patch: PatchConfig) -> PatchProfile:

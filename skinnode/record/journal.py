@@ -170,7 +170,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     if not good.all():
         raise ValueError(f"baseline_ohm: got {baseline[~good][0]:g}, must be positive")
     own = table["layout"]
-    if own is None:
+    if own is None or patch.layout.coordinates == "preset":  # set by skinnode resolve instead of the node's
         layout = patch.layout.build()
     else:
         layout = PatchLayout(

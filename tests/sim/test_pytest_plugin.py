@@ -141,6 +141,17 @@ def test_a_scene_of_faults_is_kept_without_a_plot(tmp_path: Path) -> None:
     assert "test_faults.py_test_fails: trace.log, truth.npz, scene.json\n" in printed
 
 
+def test_a_failed_set_up_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "test_early.py").write_text(
+        "import pytest\n\n\n@pytest.fixture\ndef ready(skin_hand):\n    skin_hand('hand.toml')\n"
+        "    raise AssertionError\n\n\ndef test_early(ready):\n    pass\n"
+    )
+    printed = run(tmp_path, "test_early.py").stdout
+    assert "1 error in" in printed
+    assert "test_early.py_test_early: trace.log, truth.npz\n" in printed
+    assert np.load(next((tmp_path / "skin-kept").glob("*/truth.npz")))["palm time_ns"].size > 0
+
+
 EXAMPLE = str(Path(__file__).parents[2] / "examples" / "hand.toml")
 
 

@@ -305,14 +305,14 @@ def test_disabling_the_chunk_pdo_under_way_is_told_by_the_summary(operational) -
     assert [data[:5] for can_id, data in frames if can_id == CHUNK] == ["00 03", "01 03", "02 03", "03 03"]
 
 
-class Refusing(list):
+class Refusing(list[tuple[int, bytes, int]]):
     """What is sent, but for the frame with this number, which the bus refuses."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self._left = number
 
-    def append(self, item: object) -> None:
+    def append(self, item: tuple[int, bytes, int]) -> None:
         self._left -= 1
         if self._left == -1:
             raise BusError("can0: no buffer space available")

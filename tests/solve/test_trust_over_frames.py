@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.model.data_fault import FaultyPart
 from skinnode.model.layout import Float
+from skinnode.solve.checks.explanations import Group
+from skinnode.solve.checks.fault_list import FaultList
 from skinnode.solve.inputs import CodeMap
 
 LAYOUT = sk.PatchLayout.preset("staggered", upper_wires=6, upper_electrodes=5)
@@ -137,3 +140,21 @@ def test_a_fault_stays_listed_while_the_noise_is_estimated_in_each_frame() -> No
             since |= {fault.since for fault in field.faults}
             assert posterior.check.left_out is not None
     assert len(since) == 1
+
+
+def test_a_repaired_reading_is_used_again_however_often_it_was_wrong() -> None:
+    shape = LAYOUT.shape
+    faults, group = FaultList(shape), Group(FaultyPart.CROSSING, 2, 7, 50.0)
+    right, known = np.zeros(shape), np.ones(shape, bool)
+    number = 0
+    for _ in range(12):  # a loose contact
+        while faults.mask is None:
+            faults.add([group], number, number)
+            number += 1
+        for waited in range(10_000):
+            if faults.mask is None:
+                break
+            faults.follow(right, known)
+            number += 1
+    assert faults.mask is None
+    assert waited == 4096

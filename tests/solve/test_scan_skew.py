@@ -328,3 +328,20 @@ def test_a_new_contact_may_not_have_been_there_when_the_first_wire_was_sampled()
     assert found.normal_force_std_n >= 2.0 * np.sqrt(share * (1.0 - share))
     assert found.normal_force_std_n < 2.0
     np.testing.assert_array_equal(found.centroid_m[:2], [pitch, 4 * pitch])
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_field_without_a_solution_does_not_say_that_a_contact_is_gone(late):
+    skew, pitch, rate_n_s = ScanSkew(SMALL, ROW_S, PERIOD_S), SMALL.pitch_m, 3.0
+    for number in range(6):
+        t_s = PERIOD_S * number
+        seen = contact((pitch, 3 * pitch), 2.0 + rate_n_s * (t_s + 3 * ROW_S))
+        field = field_of(np.full(SMALL.upper_m.shape, 1e-4 * number), contacts=(seen,))
+        if number == 4:
+            nothing, contradicts = np.zeros(len(WIRES), bool), field_of(field.displacement_m, 1e-6)
+            late_field = field_of(field.displacement_m, np.inf)
+            field = late_field if late else amended(contradicts, distrust="wrong", wires_trusted=nothing)
+        found = skew.at_first_wire(field, None)
+    (last,) = found.contacts
+    assert last.normal_force_n == pytest.approx(2.0 + rate_n_s * t_s, abs=1e-12)
+    assert last.normal_force_std_n == pytest.approx(1e-3, rel=1e-6)

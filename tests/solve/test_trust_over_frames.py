@@ -151,10 +151,9 @@ def test_a_repaired_reading_is_used_again_however_often_it_was_wrong() -> None:
         while faults.mask is None:
             faults.add([group], number, number)
             number += 1
-        for waited in range(10_000):
-            if faults.mask is None:
-                break
+        waited = 0
+        while faults.mask is not None and waited < 10_000:
             faults.follow(right, known)
-            number += 1
+            number, waited = number + 1, waited + 1
     assert faults.mask is None
     assert waited == 4096

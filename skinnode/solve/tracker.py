@@ -360,6 +360,7 @@ class Tracker:
         changed, self.method, self.reason = method != self.method, method, reason
         if changed and method == "posterior":
             self._posterior.reset()
+            self._posterior.stop_at(math.inf)  # the deadline of the last root check has passed
             self._posterior.noise_estimate = noise
         elif changed:
             self._posterior.noise_estimate = None

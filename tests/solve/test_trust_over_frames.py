@@ -8,6 +8,7 @@ import pytest
 import skinnode as sk
 from skinnode.model.data_fault import FaultyPart
 from skinnode.model.layout import Float
+from skinnode.process import clock
 from skinnode.solve.checks.explanations import Group
 from skinnode.solve.checks.fault_list import FaultList
 from skinnode.solve.inputs import CodeMap
@@ -157,3 +158,32 @@ def test_a_repaired_reading_is_used_again_however_often_it_was_wrong() -> None:
             number, waited = number + 1, waited + 1
     assert faults.mask is None
     assert waited == 4096
+
+
+class FrameClock(clock.SystemClock):
+    """Time passes from frame to frame, but not during a frame."""
+
+    now_ns = 0
+
+    def monotonic_ns(self) -> int:  # type: ignore[override]
+        return self.now_ns
+
+
+def test_the_deadline_of_an_exact_frame_does_not_end_the_frames_of_the_posterior() -> None:
+    rng, frames = np.random.default_rng(1), FrameClock()
+    with clock.use(frames):
+        stream = tracker(method="auto", deadline_us=5e4)
+
+        def solved(moved_m: Float, noise: float) -> sk.FieldFrame:
+            frames.now_ns += 80_000_000
+            return stream.update(reading_ohm(moved_m, rng, noise))
+
+        for moved_m in (REST_M, press_m(0.6)):  # the posterior checks the roots of such a jump
+            assert solved(moved_m, NOISE).method == "exact"
+        for _ in range(60):
+            solved(REST_M, 3e-4)
+        assert stream.method == "posterior"
+        moved_m = press_m(0.5)
+        field = solved(moved_m, 3e-4)
+    assert set(field.status) == {sk.Status.CONVERGED}
+    assert (np.abs(field.displacement_m - moved_m) < 5 * field.displacement_std_m).all()

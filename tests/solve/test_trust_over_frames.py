@@ -187,3 +187,15 @@ def test_the_deadline_of_an_exact_frame_does_not_end_the_frames_of_the_posterior
         field = solved(moved_m, 3e-4)
     assert set(field.status) == {sk.Status.CONVERGED}
     assert (np.abs(field.displacement_m - moved_m) < 5 * field.displacement_std_m).all()
+
+
+def test_a_field_without_a_solved_wire_has_no_contacts() -> None:
+    rng = np.random.default_rng(5)
+    posterior = sk.Posterior(LAYOUT, relative_noise=1e-4, baseline_ohm=REST_OHM)
+    assert posterior.update(reading_ohm(press_m(0.2), rng, 1e-4)).contacts
+    posterior.stop_at(0.0)
+    late = posterior.update(reading_ohm(press_m(0.3), rng, 1e-4))
+    assert set(late.status) == {sk.Status.DEADLINE}
+    assert late.contacts == ()
+    posterior.stop_at(np.inf)
+    assert posterior.update(reading_ohm(press_m(0.3), rng, 1e-4)).contacts

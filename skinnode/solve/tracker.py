@@ -366,6 +366,7 @@ class Tracker:
             self._posterior.noise_estimate = None
             self._exact.reset()
             self._gate.reset()
+            self._check.reset()
             if self._contacts is not None:
                 self._contacts.reset()
 

@@ -199,3 +199,28 @@ def test_a_field_without_a_solved_wire_has_no_contacts() -> None:
     assert late.contacts == ()
     posterior.stop_at(np.inf)
     assert posterior.update(reading_ohm(press_m(0.3), rng, 1e-4)).contacts
+
+
+def test_faults_of_the_exact_method_do_not_return_after_the_posterior() -> None:
+    least, most, steps = 0.25, 1.25, 2**24 - 4
+    step = (most - least) / steps
+    codes = CodeMap(REST_OHM, least, step, steps, step / np.sqrt(12) * REST_OHM, NOISE)
+    rng, stream = np.random.default_rng(1), tracker(method="auto", codes=codes, detect=False)
+
+    def field(noise: float, wrong: float = 1.0) -> sk.FieldFrame:
+        ohm = reading_ohm(REST_M, rng, noise)
+        ohm[2, 7] *= wrong
+        return stream.update_codes(np.rint((ohm / REST_OHM - least) / step).astype(np.uint32))[0]
+
+    for _ in range(8):
+        assert field(NOISE, wrong=0.9).method == "exact"
+    assert field(NOISE, wrong=0.9).faults
+    methods = [field(3e-4).method for _ in range(60)]
+    assert methods[-1] == "posterior"
+    for _ in range(120):
+        last = field(NOISE)
+        if last.method == "exact":
+            break
+    assert last.method == "exact"
+    assert not last.faults
+    assert last.trusted

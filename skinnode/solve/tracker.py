@@ -152,6 +152,7 @@ class Tracker:
         if self._skew is not None:
             self._skew.reset()
         if self._exact is None:
+            self._follow_noise()
             return
         self._exact.reset()
         self._gate.reset()

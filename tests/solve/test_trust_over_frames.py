@@ -224,3 +224,17 @@ def test_faults_of_the_exact_method_do_not_return_after_the_posterior() -> None:
     assert last.method == "exact"
     assert not last.faults
     assert last.trusted
+
+
+@pytest.mark.parametrize("method", ["exact", "posterior"])
+def test_after_a_reset_the_first_frame_is_judged_by_the_stated_noise(method: str) -> None:
+    rng, used, new = np.random.default_rng(4), tracker(method=method), tracker(method=method)
+    for _ in range(60):
+        used.update(reading_ohm(REST_M, rng, 20 * NOISE))
+    used.reset()
+    ohm = reading_ohm(press_m(0.003), rng)
+    again, expected = used.update(ohm), new.update(ohm)
+    assert expected.touched
+    assert again.touched
+    assert again.touch_odds == expected.touch_odds
+    np.testing.assert_array_equal(again.displacement_std_m, expected.displacement_std_m)

@@ -127,6 +127,24 @@ def test_after_a_gap_the_past_is_not_used():
     assert field.displacement_std_m.max() < 1e-5  # of 0.4 mm
 
 
+def test_a_long_scan_period_is_no_gap():
+    slow = 150.0  # scans every 3 s
+    times = slow * PERIOD_S * np.arange(14)
+    depth, row_s = (lambda t_s: pressing(t_s / slow)), slow * ROW_S
+    fields = []
+    for stamped in (True, False):
+        rng, solver = np.random.default_rng(1), tracker(row_time_s=row_s, scan_period_s=slow * PERIOD_S)
+        for t_s in times:
+            if stamped:
+                solver.t_ns = round(t_s * SECOND_NS)
+            rows = [truth_m(depth, t_s + u * row_s)[u] for u in WIRES]
+            ohm = frame_ohm(SMALL, np.stack(rows)) * (1.0 + SIGMA * rng.standard_normal(SMALL.shape))
+            fields.append(solver.update(ohm))
+    for with_times, without in zip(fields[:14], fields[14:], strict=True):
+        np.testing.assert_array_equal(with_times.displacement_m, without.displacement_m)
+        np.testing.assert_array_equal(with_times.displacement_std_m, without.displacement_std_m)
+
+
 @pytest.mark.parametrize("jump_s", [0.101, 0.109, 0.113, 0.119])
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 def test_the_standard_deviations_cover_an_onset_and_a_release_between_two_scans(method, jump_s):

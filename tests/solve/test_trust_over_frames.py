@@ -238,3 +238,18 @@ def test_after_a_reset_the_first_frame_is_judged_by_the_stated_noise(method: str
     assert again.touched
     assert again.touch_odds == expected.touch_odds
     np.testing.assert_array_equal(again.displacement_std_m, expected.displacement_std_m)
+
+
+@pytest.mark.parametrize("every", [2, 3])
+@pytest.mark.parametrize("given", [False, True])
+def test_a_touch_ends_although_the_noise_alternates(every: int, given: bool) -> None:
+    rng, stream, moved_m = np.random.default_rng(5), tracker(), press_m(0.1)
+    touched = []
+    for number in range(40):
+        noise = NOISE if number % every else 3 * NOISE
+        ohm = reading_ohm(moved_m if 6 <= number < 15 else REST_M, rng, noise)
+        field = stream.update(ohm, relative_noise=noise if given or noise > NOISE else None)
+        touched.append(field.touched)
+    assert all(touched[6:15])
+    assert not any(touched[:6])
+    assert not any(touched[20:])

@@ -299,13 +299,14 @@ def test_without_power_nothing_becomes_due(virtual: VirtualClock) -> None:
     with Fleet(HAND) as fleet:
         fleet.inject(Faults(babble_per_s=10.0), "palm")
         clock.sleep(0.55)
-        assert fleet.injected("palm").babbled == 5
+        before = fleet.injected("palm").babbled
+        assert 4 <= before <= 5  # the node boots first
         fleet.inject(Faults(babble_per_s=10.0, unplugged=True), "palm")
         clock.sleep(2.0)
-        assert fleet.injected("palm").babbled == 5
+        assert fleet.injected("palm").babbled == before
         fleet.inject(Faults(babble_per_s=10.0), "palm")
         clock.sleep(0.55)
-        assert 9 <= fleet.injected("palm").babbled <= 10  # the node boots first
+        assert before + 4 <= fleet.injected("palm").babbled <= before + 5
 
 
 def test_a_second_node_with_the_node_id(virtual: VirtualClock) -> None:

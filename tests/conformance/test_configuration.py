@@ -70,7 +70,8 @@ def test_an_interrupted_run_resets_the_node(dut: Dut) -> None:
 
 def test_a_restoration_that_is_interrupted_is_done_again(dut: Dut, monkeypatch: pytest.MonkeyPatch) -> None:
     configure(dut)
-    write, interrupted = dut.sdo.write, []
+    interrupted: list[bool] = []
+    write = dut.sdo.write
 
     def write_until_interrupted(index: int, subindex: int, data: bytes) -> None:
         if index == 0x1015 and not interrupted:

@@ -123,10 +123,10 @@ def view(
         port=PORT if port is None else port,
     )
     converts = replay is not None and save is not None and speed is None and not web
-    for option, value in (("--rate", rate), ("--seconds", seconds)):
-        if value is not None and converts:
+    for option, number in (("--rate", rate), ("--seconds", seconds)):
+        if number is not None and converts:
             allowed = "with --replay and --save only together with --speed; otherwise, all fields are drawn"
-            raise ConfigError(option, value, allowed)
+            raise ConfigError(option, number, allowed)
     from skinnode.process.signals import stop_on_signal
     from skinnode.view.drawing_thread import RATE_HZ
 
@@ -172,15 +172,16 @@ def _watch(options: WatchOptions, drawing: _Drawing) -> tuple[list[str], DrawnCo
         stop = opened.enter_context(stop_on_signal())
         stack = opened.enter_context(ExitStack())
         output = _open(stack, drawing.output)
-        unused = [] if output.save is None else [output.save]  # a file without fields would make a retry fail
-        stack.callback(lambda: [file.unlink(missing_ok=True) for file in unused])
+        unused = stack.enter_context(ExitStack())
+        if output.save is not None:  # a file without fields would make a retry fail
+            unused.callback(output.save.unlink, missing_ok=True)
         process = _draw_on(stack, output, source_of, drawing)
         try:
             with progress() as tell:
                 source = source_of.start(stack, stop, tell)
         except BringUpCancelled:
             return None
-        unused.clear()
+        unused.pop_all()
         return _show(output, process, source, stop, drawing)
 
 

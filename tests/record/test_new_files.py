@@ -82,6 +82,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_disk_that_is_full_at_the_end_of_a_conversion_is_an_error(source: Path) -> None:
     targets = [suffix for suffix in TARGETS if suffix != ".log"]
     with Recorder(a_hand(), source.with_name("run.mcap")) as recorder:

@@ -97,8 +97,7 @@ def messages_in(path: Path | str) -> list[tuple[object, ...]]:
 @pytest.mark.parametrize(
     ("kind", "count"),
     [
-        ("mcap", 2),
-        *(pytest.param(*each, marks=pytest.mark.long) for each in (("mcap", 1), ("parquet", 2))),
+        *(pytest.param(*each, marks=pytest.mark.long) for each in (("mcap", 2), ("mcap", 1), ("parquet", 2))),
         ("parquet", 1),
     ],
 )
@@ -117,6 +116,7 @@ def test_the_file_is_the_one_that_convert_writes(
     assert result["faults"] == result["notes"] == []
 
 
+@pytest.mark.long
 def test_the_file_of_a_damaged_recording_is_the_one_that_convert_writes(
     recording: Path, tmp_path: Path, in_turn: None
 ) -> None:
@@ -179,6 +179,7 @@ def test_a_calibration_of_one_patch_changes_its_forces_only(recording: Path, tmp
     assert forces > 10
 
 
+@pytest.mark.long
 def test_a_replay_of_a_result_gives_its_fields(recording: Path, tmp_path: Path, in_turn: None) -> None:
     """The journal of the MCAP file contains the options with which it was solved."""
     setting = "solver.method=posterior"
@@ -385,6 +386,7 @@ main()
 """The command, which is killed before the first file of results is complete."""
 
 
+@pytest.mark.long
 def test_a_command_killed_while_it_writes_a_result_leaves_only_the_work_folder(
     recording: Path, tmp_path: Path, in_turn: None
 ) -> None:
@@ -499,6 +501,7 @@ def test_two_commands_do_not_share_a_folder(recording: Path, tmp_path: Path) -> 
     assert "allowed: a folder that no other skinnode resolve is using" in said
 
 
+@pytest.mark.long
 def test_a_damaged_recording_is_solved_and_named(recording: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.log"
     data = recording.read_bytes()

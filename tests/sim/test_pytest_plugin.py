@@ -112,6 +112,7 @@ def in_virtual_time(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return folder, run(folder)
 
 
+@pytest.mark.long
 def test_the_same_suite_in_virtual_and_in_real_time(in_virtual_time: Run, tmp_path: Path) -> None:
     for done, passed, skipped in ((in_virtual_time[1], 4, 0), (run(tmp_path, "--skin-bus=virtual"), 2, 2)):
         assert re.search(rf"1 failed, {passed} passed(, {skipped} skipped)? in", done.stdout), done.stdout

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from skinnode.errors import ConfigError
+from skinnode.files.output_file import write_text
 from skinnode.files.whole_file import discard_leftovers, replace_file
 
 SKINNODE = Path(sys.executable).with_name("skinnode")
@@ -58,6 +59,22 @@ def test_an_output_may_be_a_link_or_no_file_at_all(tmp_path: Path) -> None:
     printed = eds("/dev/stdout")
     assert printed.returncode == 0
     assert target.read_text() in printed.stdout
+
+
+def test_an_output_keeps_permissions_that_new_files_do_not_get(tmp_path: Path) -> None:
+    """Those of a group that shares the file, although the umask refuses them to new files."""
+    target = tmp_path / "patch.eds"
+    target.touch()
+    target.chmod(0o664)
+    before = os.umask(0o022)
+    try:
+        write_text("--output", target, "new")
+        write_text("--output", tmp_path / "other.eds", "new")
+    finally:
+        os.umask(before)
+    modes = {file.name: file.stat().st_mode & 0o777 for file in tmp_path.iterdir()}
+    assert modes == {"patch.eds": 0o664, "other.eds": 0o644}
+    assert target.read_text() == "new"
 
 
 def test_what_is_planted_beside_is_not_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,6 @@ receive them.
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from skinnode.config import BusConfig
 from skinnode.errors import BusError, ConfigError
 from skinnode.process import clock
 from skinnode.transport import CanPort
+from vcan_sim.faults import RATE_PER_S, check_range
 from vcan_sim.timed_bus import CanFrame
 from vcan_sim.timed_bus.wire_frame import wire_frame
 
@@ -33,6 +33,8 @@ _MOST_AT_ONCE: Final = 256
 """Maximum number of overdue rogue frames of one kind in a batch. The rest are dropped."""
 _RETRY_S: Final = 0.05
 """Time from a bus error until the rogue device reopens its endpoint, in s."""
+_LONGEST_WAIT_S: Final = 3600.0
+"""Longest wait for the next rogue frame, in s. A wait of centuries is an error."""
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
@@ -44,7 +46,8 @@ class BusFaults:
     """Faults on one bus; none by default.
 
     Raises:
-        ConfigError: If a fraction is not between 0 and 1, or if the seed or a rate is negative.
+        ConfigError: If a fraction is not between 0 and 1, if a rate is out of range, or if the seed is
+            negative.
     """
 
     seed: int = 1
@@ -55,9 +58,10 @@ class BusFaults:
     """Fraction of the bus capacity used by a rogue device, which sends frames with COB-ID 0x001, the highest
     priority after NMT."""
     rogue_nmt_per_s: float = 0.0
-    """Rate of random NMT commands from a second master, 1/s. Each is sent to one node or to all nodes."""
+    """Rate of random NMT commands from a second master, 1/s, at most 1e5. Each is sent to one node or to all
+    nodes."""
     rogue_sync_per_s: float = 0.0
-    """Rate of SYNC messages from a second master, 1/s."""
+    """Rate of SYNC messages from a second master, 1/s, at most 1e5."""
     disturbed: float = 0.0
     """Fraction of transmissions aborted by an error frame. The sender repeats them. Only the ``timed``
     interface supports this fault."""
@@ -69,8 +73,7 @@ class BusFaults:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ConfigError(name, getattr(self, name), "a fraction from 0 to 1")
         for name in _RATES:
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ConfigError(name, getattr(self, name), "a non-negative number")
+            check_range(name, getattr(self, name), *RATE_PER_S)
 
     @property
     def needs_attacker(self) -> bool:
@@ -172,7 +175,7 @@ class BusAttacker:
                 pass
             first_ns = min(due_ns[name] - (_AHEAD_NS if name == "starved" else 0) for name in due_ns)
             wait_ns = max(first_ns - clock.monotonic_ns(), _TICK_NS if "starved" in due_ns else 0)
-            self._changed.wait(max(wait_ns, 0) * 1e-9)
+            self._changed.wait(min(max(wait_ns, 0) * 1e-9, _LONGEST_WAIT_S))
             self._changed.clear()
 
     def _periods_ns(self) -> dict[str, float]:

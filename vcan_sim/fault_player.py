@@ -42,9 +42,11 @@ class FaultPlayer:
         self._thread = clock.thread(self._run, "faults of the scene")
 
     def start(self) -> None:
-        """Start the thread. It waits for :meth:`begin`, unless the schedule has begun before."""
-        if self._thread.ident is not None:  # a thread can be started only once
-            self._new_thread()
+        """Start the thread. It waits for :meth:`begin`, unless the schedule has begun before.
+
+        The thread runs on the clock of the calling thread, even if the player was created on another clock.
+        """
+        self._new_thread()
         if self._origin_ns is not None:
             elapsed_s = (clock.monotonic_ns() - self._origin_ns) * 1e-9
             self._inbox.put(_Start(self._origin_ns, elapsed_s))

@@ -54,9 +54,26 @@ OF_WIRES: Final = (
     "crossed_lower",
 )
 """Faults whose value is a wire number; faults of upper and lower wires alternate."""
-_RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
+RATE_PER_S: Final = (1e-6, 1e5)
+"""Minimum and maximum rate of a fault, 1/s, unless it is 0. A bus of 1 Mbit/s carries fewer frames than the
+maximum."""
+_RANGES: Final = {"emcy_per_s": RATE_PER_S, "babble_per_s": RATE_PER_S, "restart_every_s": (1e-3, 1e6)}
+"""Minimum and maximum of each fault that repeats, unless it is 0."""
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
 """Maximum absolute value of each fault that can be negative."""
+
+
+def check_range(name: str, value: float, least: float, greatest: float) -> None:
+    """Raise ConfigError unless a rate or an interval is 0, or lies in a range.
+
+    Args:
+        name: Name of the fault.
+        value: Its value.
+        least: Minimum, if the value is not 0.
+        greatest: Maximum.
+    """
+    if value != 0.0 and not least <= value <= greatest:
+        raise ConfigError(name, value, f"0, or a number from {least:g} to {greatest:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,12 +207,12 @@ class Faults:
     """Whether a second node on the bus has the same node-ID. The second node boots, responds to all commands
     and reports an untouched patch. It disappears when the fault ends."""
     restart_every_s: float = 0.0
-    """Interval between spontaneous resets of the node, in s; 0 for no resets."""
+    """Interval between spontaneous resets of the node, in s, at least 1e-3; 0 for no resets."""
     emcy_per_s: float = 0.0
-    """Rate of spurious emergency messages, 1/s. When the fault ends, the node sends an *error reset*
-    message."""
+    """Rate of spurious emergency messages, 1/s, at most 1e5. When the fault ends, the node sends an *error
+    reset* message."""
     babble_per_s: float = 0.0
-    """Rate of stray frames with the unused COB-ID 0x3F0, 1/s."""
+    """Rate of stray frames with the unused COB-ID 0x3F0, 1/s, at most 1e5."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -220,9 +237,12 @@ class Faults:
             raise ConfigError(name, given[name], "both stuck_upper and stuck_lower, which name a crossing")
 
     def _check_numbers(self) -> None:
-        for name in _RATES:
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ConfigError(name, getattr(self, name), "a non-negative number")
+        for name, (least, greatest) in _RANGES.items():
+            check_range(name, getattr(self, name), least, greatest)
+        if self.struck is not None and self.struck < 0:
+            raise ConfigError("struck", self.struck, "a non-negative integer")
+        if self.miscounted_by is not None and self.miscounted_by % 256 == 0:
+            raise ConfigError("miscounted_by", self.miscounted_by, "an integer that 256 does not divide")
         for name, most in _MOST.items():
             if not -most <= getattr(self, name) <= most:
                 raise ConfigError(name, getattr(self, name), f"a number from {-most:g} to {most:g}")
@@ -299,17 +319,20 @@ class Injected:
 NO_FAULTS: Final = Faults()
 
 
-def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
-    """Check that a patch has the wires named in its faults.
+def check_places(faults: Faults, patch: str, shape: tuple[int, int], chunks: int) -> None:
+    """Check that a patch has the wires and the chunk named in its faults.
 
     Args:
         faults: Faults of the patch.
         patch: Name of the patch.
         shape: Number of upper wires and number of lower wires of the patch.
+        chunks: Number of chunks in a scan of the patch.
 
     Raises:
-        ConfigError: If a wire number is too large for the patch.
+        ConfigError: If a number is too large for the patch.
     """
+    if faults.struck is not None and faults.struck >= chunks:
+        raise ConfigError(f"{patch}: struck", faults.struck, f"an integer from 0 to {chunks - 1}")
     for number, name in enumerate(OF_WIRES):
         wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next wire
         if (wire := getattr(faults, name)) is not None and wire >= wires:

@@ -33,6 +33,8 @@ class FaultyConverter:
         baseline_ohm: Function that returns the baseline R0 in ohms, (U, K), to which codes refer.
         scale: Code scale of the node.
         temperature_per_k: Temperature coefficient of all resistances, 1/K.
+        on_repeat: Function called with the time (ns) of each reading in which a frozen converter repeats the
+            last one.
     """
 
     def __init__(  # noqa: PLR0913 - all parts of a node's converter
@@ -44,7 +46,9 @@ class FaultyConverter:
         baseline_ohm: Callable[[], Float],
         scale: CodeScale,
         temperature_per_k: float = EXACT.temperature_per_k,
+        on_repeat: Callable[[int], object] = lambda t_ns: None,
     ) -> None:
+        self._on_repeat = on_repeat
         self._source, self._injector, self._booting = source, injector, booting
         self._baseline_ohm, self._scale = baseline_ohm, scale
         self._temperature_per_k = temperature_per_k
@@ -65,6 +69,7 @@ class FaultyConverter:
         self._injector.injected.uncounted += self._injector.faults.uncounted
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
+            self._on_repeat(t_ns)
         else:
             self._reading = self._flip(self._through_wires(self._shifted(self._source.read(t_ns), t_ns)))
             self._conversions = conversions_of(self._source)

@@ -79,9 +79,11 @@ class FaultyNode(PatchNode):
         profile: Protocol profile of the node.
         faults: Initial faults. Their seed remains in use when the faults are replaced.
         temperature_per_k: Temperature coefficient of all resistances, 1/K.
+        on_repeat: Function called with the time (ns) of each reading in which a frozen converter repeats the
+            last one.
     """
 
-    def __init__(  # noqa: PLR0913 - the arguments of PatchNode and three more
+    def __init__(  # noqa: PLR0913 - the arguments of PatchNode and four more
         self,
         node_id: int,
         layout: PatchLayout,
@@ -93,6 +95,7 @@ class FaultyNode(PatchNode):
         profile: PatchProfile,
         faults: Faults = NO_FAULTS,
         temperature_per_k: float = EXACT.temperature_per_k,
+        on_repeat: Callable[[int], object] = lambda t_ns: None,
     ) -> None:
         self._injector = Injector(faults, node_id)
         self._periods_ns = _periods_ns(faults)
@@ -117,6 +120,7 @@ class FaultyNode(PatchNode):
             baseline_ohm=lambda: self.baseline_ohm,
             scale=CodeScale(profile.code_bits),
             temperature_per_k=temperature_per_k,
+            on_repeat=on_repeat,
         )
         super().__init__(
             node_id,
@@ -255,6 +259,7 @@ class FaultyNode(PatchNode):
             self._faulty_scans.power_off()
             self.injected.unplugged += 1
         else:
+            self._due_ns = dict.fromkeys(self._due_ns, 0)  # nothing was due without power
             self.power_on(t_ns)
 
     def _reset_if_due(self, t_ns: int) -> None:

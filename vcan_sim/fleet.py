@@ -19,7 +19,7 @@ from skinnode.protocol.profile import PatchProfile
 from vcan_sim.bus_attacker import BusFaults, InjectedOnBus
 from vcan_sim.default_scene import Scene
 from vcan_sim.fault_player import FaultPlayer
-from vcan_sim.faults import NO_FAULTS, Faults, Injected, check_wires
+from vcan_sim.faults import NO_FAULTS, Faults, Injected, check_places
 from vcan_sim.faulty_bus import FaultyBus, FaultyPort, Passed
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.fleet_faults import FleetFaults, Places
@@ -72,9 +72,9 @@ class Fleet:
             once, as soon as any node has sent its first scan.
 
     Raises:
-        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` names an
-            unknown patch or reduces the gap between two electrodes too much; or if the scene contains a touch
-            or a fault that is impossible on its patch or bus.
+        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` or
+            ``unchecked`` names an unknown patch; if ``imperfections`` reduces the gap between two electrodes
+            too much; or if the scene contains a touch or a fault that is impossible on its patch or bus.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of which are rarely used
@@ -92,7 +92,11 @@ class Fleet:
         self.hand = hand.on(interface, channel)
         if imperfections is None:
             imperfections = EXACT if scene is None else scene.patch_imperfections()
-        sizes = _by_patch(imperfections, [patch.name for patch in hand.patches])
+        names = [patch.name for patch in hand.patches]
+        sizes = _by_patch(imperfections, names)
+        for name in unchecked:
+            if name not in names:
+                raise ConfigError("unchecked", name, f"a patch of the hand: {', '.join(names)}")
         self._scenes = {} if scene is None else bind_scene(scene, self.hand)
         self._beginning = Lock()
         self._stations = {
@@ -403,11 +407,12 @@ class _Station:
             profile=self._profile,
             faults=self._faults,
             temperature_per_k=self.source.skin.imperfections.temperature_per_k,
+            on_repeat=self.source.note_repeat,
         )
         return self._node
 
     def check(self, faults: Faults) -> None:
-        check_wires(faults, self._config.name, self.source.scene.layout.shape)
+        check_places(faults, self._config.name, self.source.scene.layout.shape, self._profile.n_chunks)
 
     def inject(self, faults: Faults) -> None:
         self._faults = faults

@@ -343,10 +343,10 @@ def skin_faults(_skin_test: SkinTest) -> SkinFaults:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """If a test of a simulated hand fails, save the hand's data and list the files in the test report."""
+    """If a test of a simulated hand or its set-up fails, save the hand's data and list the files."""
     report = yield
     test = item.stash.get(_TEST, None)
-    if test is not None and report.when == "call" and report.failed:
+    if test is not None and report.when in ("setup", "call") and report.failed:
         name = re.sub(r"[^\w.-]+", "_", item.nodeid)[-150:]
         folder = Path(item.config.getoption("--skin-kept")) / name
         try:

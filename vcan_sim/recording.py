@@ -56,7 +56,8 @@ def channels_of(buses: Iterable[str]) -> dict[str, str]:
 class Recording:
     """Recording of a fleet during a ``with`` block, which must enclose the fleet's ``with`` block.
 
-    Call :meth:`poll` at least once a minute, because patches store a limited number of readings.
+    Call :meth:`poll` at least once a minute, because patches store a limited number of readings. If an
+    exception ends the block before the first frame and the first reading, the folder is removed again.
 
     Args:
         folder: New folder for the files.
@@ -106,6 +107,11 @@ class Recording:
             self.poll()
             self._open = opened.pop_all()
 
+    def _is_empty(self) -> bool:
+        """Return whether neither a frame nor a reading has been recorded, because the fleet did not start."""
+        readings = any(patch.read_times_ns() for patch in self._fleet.patches.values())
+        return not readings and (self._folder / TRACE).stat().st_size == 0
+
     def _discard(self) -> None:
         with contextlib.suppress(OSError):
             for name in (SCENE, TRACE, FAULTS):
@@ -116,6 +122,9 @@ class Recording:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._open.close()
+        if error is not None and self._is_empty():  # as if it had not begun
+            self._discard()
+            return
         self.poll()
         arrays: dict[str, Any] = {name: np.array(values) for name, values in self._truth.items()}
         np.savez_compressed(self._folder / TRUTH, **arrays)

@@ -113,6 +113,14 @@ class SimulatedPatch:
         read = self.skin.converted_ohm(noisy, self.reads)
         return read if self.fault is None else self.fault(read, t_ns)
 
+    def note_repeat(self, t_ns: int) -> None:
+        """Store the time of a reading in which a frozen converter repeats the last one.
+
+        The scan is sent with the time of this reading, for which there is a ground truth, too.
+        """
+        self.last_read_ns = t_ns
+        self._remember(t_ns)
+
     def exact_ohm(self, t_ns: int) -> Float:
         """Return the noise-free resistances (U, K) at ``t_ns`` in ohms."""
         t_s = self.scene_s(t_ns)

@@ -53,6 +53,7 @@ class VirtualClock:
 
     Raises:
         Deadlock: In the thread that entered the block, if all threads are waiting for each other.
+        BaseException: In the same thread, if a function passed to :meth:`call_at` has raised it.
         RuntimeError: On leaving the block, if a thread is still running.
     """
 
@@ -145,7 +146,8 @@ class VirtualClock:
 
         Args:
             t_ns: Monotonic time of the call, in ns. A time in the past means as soon as possible.
-            function: Function to call. It must not wait.
+            function: Function to call. It must not wait. If it raises an exception, the thread that entered
+                the ``with`` block raises it when it waits.
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
 
@@ -192,16 +194,20 @@ class VirtualClock:
         """
         turn = self._running
         turn.woken, turn.waiting = False, waiting
-        waiting.append(turn)
-        if seconds is not None:
-            due_ns = self._now_ns + max(0, round(seconds * 1e9))
-            heapq.heappush(self._timers, (due_ns, next(self._number), turn.waits, turn))
+        begun_ns = self._now_ns
+        due_ns = None if seconds is None else begun_ns + max(0, round(seconds * 1e9))
         try:
+            waiting.append(turn)
+            if due_ns is not None:
+                heapq.heappush(self._timers, (due_ns, next(self._number), turn.waits, turn))
             self._pass_on(turn)
         except BaseException:
+            self._stop_waiting(turn)
             if turn.woken:  # wake another thread instead
                 self.wake(waiting)
             raise
+        if self._now_ns > begun_ns:  # also if no other thread had a turn meanwhile
+            self._readings = 0
         return turn.woken
 
     def wake(self, waiting: deque[_Turn]) -> None:
@@ -231,6 +237,14 @@ class VirtualClock:
         if turn is self._first and turn.error is not None:
             error, turn.error = turn.error, None
             raise error
+
+    def _stop_waiting(self, turn: _Turn) -> None:
+        """End the wait of a thread that still has the turn, because a signal handler raised an exception."""
+        if turn in turn.waiting:
+            turn.waiting.remove(turn)
+            turn.waits += 1
+        if turn in self._ready:
+            self._ready.remove(turn)
 
     def _await_turn(self, turn: _Turn, waits: int) -> None:
         """Block the current thread until its turn.
@@ -268,12 +282,11 @@ class VirtualClock:
         while not self._ready:
             if not self._timers:
                 names = ", ".join(repr(turn.name) for turn in self._alive)
-                self._first.error = Deadlock(
-                    f"virtual time: every thread waits for another thread; waiting: {names}"
-                )
-                self._first.waits += 1
-                self._first.waiting.remove(self._first)
-                return self._first
+                deadlock = Deadlock(f"virtual time: every thread waits for another thread; waiting: {names}")
+                self._raise_in_first(deadlock)
+                if not self._ready:  # the first thread has left the ``with`` block
+                    raise deadlock
+                break
             due_ns, _, waits, what = heapq.heappop(self._timers)
             if isinstance(what, _Turn):
                 if what.waits != waits:
@@ -283,8 +296,21 @@ class VirtualClock:
                 self._ready.append(what)
             self._now_ns = max(self._now_ns, due_ns)
             if not isinstance(what, _Turn):
-                what()
+                try:
+                    what()
+                except BaseException as error:
+                    # Raised here, it would end whichever thread happens to be waiting, and stop the others.
+                    self._raise_in_first(error)
         return self._ready.popleft()
+
+    def _raise_in_first(self, error: BaseException) -> None:
+        """End the first thread's wait with an exception. If it is not waiting, its next wait ends with it."""
+        first = self._first
+        first.error = first.error or error
+        if first in first.waiting:
+            first.waits += 1
+            first.waiting.remove(first)
+            self._ready.append(first)
 
 
 def _closed_gate() -> threading.Lock:
@@ -305,7 +331,7 @@ class _Turn:
         """Threads that wait for the same condition, including this one."""
         self.waits = 0
         """Number of completed waits. Timers set for earlier waits have a smaller number and are ignored."""
-        self.error: Exception | None = None
+        self.error: BaseException | None = None
 
 
 class _Event(threading.Event):

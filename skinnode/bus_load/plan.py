@@ -204,11 +204,13 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
     """Return the inhibit time (0x1800:3, unit 100 µs) that makes a scan last SCAN_SHARE of the SYNC period.
 
+    A scan lasts less than that if the object, an UNSIGNED16, cannot hold the inhibit time.
+
     Args:
         period_ms: SYNC period, in ms.
         frames: number of frames in a scan.
     """
-    return int(period_ms * 10 * SCAN_SHARE / frames)
+    return min(int(period_ms * 10 * SCAN_SHARE / frames), 0xFFFF)
 
 
 def _profile(hand: HandConfig, i: int, patch: PatchConfig) -> PatchProfile:
@@ -268,7 +270,8 @@ def _of_a_patch(
     period_s, beat_s, node_id = hand.sync.period_s, hand.bring_up.heartbeat_s, patch.node_id
     yield _classic(bus, f"EMCY of {patch.name}", od.emcy_cob_id(node_id), 8, beat_s)
     cob_id, length = od.chunk_cob_id(node_id), profile.chunk_bytes
-    times = _classic_s(bus, cob_id, length) if profile.bus == "classic" else _fd_s(bus, cob_id, length)
+    # Chunks of up to 8 bytes, as of a patch with two lower wires, are classic frames on a CAN FD bus, too.
+    times = _classic_s(bus, cob_id, length) if length <= 8 else _fd_s(bus, cob_id, length)
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     name = f"chunks of {patch.name}"
     yield PlannedFrame(

@@ -196,7 +196,8 @@ def _silent(detail: bytes) -> str:
 
 
 def _wrong_length(detail: bytes) -> str:
-    got = f"RPDO{detail[0]}, {counted(detail[1], 'byte')}"
+    number = detail[0] | (detail[3] << 8 if len(detail) > 3 else 0)
+    got = f"RPDO{number}, {counted(detail[1], 'byte')}"
     return f"{got} instead of {detail[2]}" if len(detail) >= 3 else got
 
 

@@ -46,31 +46,48 @@ def find_buses(
     Raises:
         ConfigError: The options are not valid.
     """
-    from pydantic import ValidationError
-
-    from skinnode.config import BusConfig
     from skinnode.errors import ConfigError
 
     if hand is None:
         if bus is not None:
             raise ConfigError("--bus", bus, "only with a hand file")
-        try:
-            config = BusConfig(
-                name="can0" if channel is None else channel[:64],
-                interface="socketcan" if interface is None else interface,
-                channel="can0" if channel is None else channel,
-                bitrate_bps=1_000_000 if bitrate is None else bitrate,
-                fd=fd,
-            )
-        except ValidationError as error:
-            wrong = error.errors()[0]
-            if wrong["loc"][0] == "bitrate_bps":
-                raise ConfigError("--bitrate", wrong["input"], "a bit rate from 10000 to 1000000") from None
-            option = "--interface" if wrong["loc"][0] == "interface" else "--channel"
-            raise ConfigError(option, wrong["input"], "a name of printable characters") from None
-        return [Place(config, None)]
+        return [Place(bus_of(interface, channel, bitrate, fd), None)]
     plan = _of_one_bus(_load(hand, bitrate, fd), bus).on(interface, channel)
     return [Place(item, plan) for item in plan.buses]
+
+
+def bus_of(
+    interface: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    fd: bool,
+    data_bitrate: int = 5_000_000,
+) -> BusConfig:
+    """Return the bus that the options specify without a hand file; its name is that of the channel.
+
+    Raises:
+        ConfigError: An option is not valid.
+    """
+    from pydantic import ValidationError
+
+    from skinnode.config import BusConfig
+    from skinnode.errors import ConfigError
+
+    try:
+        return BusConfig(
+            name="can0" if channel is None else channel[:64],
+            interface="socketcan" if interface is None else interface,
+            channel="can0" if channel is None else channel,
+            bitrate_bps=1_000_000 if bitrate is None else bitrate,
+            fd=fd,
+            data_bitrate_bps=data_bitrate,
+        )
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        if wrong["loc"][0] == "bitrate_bps":
+            raise ConfigError("--bitrate", wrong["input"], "a bit rate from 10000 to 1000000") from None
+        option = "--interface" if wrong["loc"][0] == "interface" else "--channel"
+        raise ConfigError(option, wrong["input"], "a name of printable characters") from None
 
 
 def find_bus(

@@ -125,7 +125,7 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
     if app.return_code:  # the package textual has reported an internal error
         raise typer.Exit(2)
     if app.terminal_is_deaf:  # output would be invisible while the screen is shown
-        raise typer.Exit(1 if app.faults.lines else 0)
+        raise typer.Exit(1 if app.faults.lines or source.flaws else 0)
     return app.faults.lines
 
 

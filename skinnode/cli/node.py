@@ -81,8 +81,8 @@ def node(
     The exit status is 2 if the node could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
+    from skinnode.cli._bus import bus_of
     from skinnode.cli._layout_option import find_layout, import_from_here
-    from skinnode.config import BusConfig
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable
     from skinnode.node import NodeRunner, PatchNode
@@ -100,14 +100,7 @@ def node(
     import_from_here()
     patch = find_layout(layout)
     profile = PatchProfile.from_layout(patch, code_bits, "fd" if fd else "classic")
-    bus = BusConfig(
-        name=channel,
-        interface=interface,
-        channel=channel,
-        bitrate_bps=bitrate,
-        fd=fd,
-        data_bitrate_bps=data_bitrate,
-    )
+    bus = bus_of(interface, channel, bitrate, fd, data_bitrate)
     measuring = make_source(source, patch, "--source")
     with _memory(store) as memory, stop_on_signal() as stop, CanPort(bus) as port:
         board = PatchNode(

@@ -25,9 +25,10 @@ def scan(
     """Find every node on a bus: by SDO, by heartbeat, and by LSS if it has no node-ID.
 
     With --hand, the command scans every bus of the hand. The command changes nothing on the nodes and takes
-    two seconds per bus. The exit status is 0 if nodes were found and none of them has a fault. The exit
-    status is 1 if no node was found, if two nodes share a node-ID, or if a node of the hand is missing or is
-    a different device. The exit status is 2 if the scan could not run.
+    two seconds per bus, or longer if heartbeats are more than a second apart. The exit status is 0 if nodes
+    were found and none of them has a fault. The exit status is 1 if no node was found, if two nodes share a
+    node-ID, or if a node of the hand is missing or is a different device. The exit status is 2 if the scan
+    could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -82,9 +82,11 @@ def view(
         ),
     ] = None,
     rate: Annotated[
-        float,
-        typer.Option(min=0.1, max=1000.0, help="Maximum drawing rate of each patch, in Hz.", metavar="HZ"),
-    ] = 30.0,
+        float | None,
+        typer.Option(
+            min=0.1, max=1000.0, help="Maximum drawing rate of each patch, in Hz; default 30.", metavar="HZ"
+        ),
+    ] = None,
     exaggerate: Annotated[
         float,
         typer.Option(min=0.0, max=1000.0, help="Factor by which to enlarge displacements.", metavar="X"),
@@ -120,10 +122,18 @@ def view(
         address=LOCAL if address is None else address,
         port=PORT if port is None else port,
     )
-    drawing = _Drawing(outputs, rate, exaggerate, seconds)
+    converts = replay is not None and save is not None and speed is None and not web
+    for option, number in (("--rate", rate), ("--seconds", seconds)):
+        if number is not None and converts:
+            allowed = "with --replay and --save only together with --speed; otherwise, all fields are drawn"
+            raise ConfigError(option, number, allowed)
     from skinnode.process.signals import stop_on_signal
+    from skinnode.view.drawing_thread import RATE_HZ
 
-    if replay is not None and save is not None and speed is None and not web:
+    drawing = _Drawing(outputs, RATE_HZ if rate is None else rate, exaggerate, seconds)
+    if converts:
+        assert replay is not None
+        assert save is not None
         with stop_on_signal() as stop:
             faults, counts = _convert(replay, Path(save), stop, exaggerate)
     else:
@@ -162,12 +172,16 @@ def _watch(options: WatchOptions, drawing: _Drawing) -> tuple[list[str], DrawnCo
         stop = opened.enter_context(stop_on_signal())
         stack = opened.enter_context(ExitStack())
         output = _open(stack, drawing.output)
+        unused = stack.enter_context(ExitStack())
+        if output.save is not None:  # a file without fields would make a retry fail
+            unused.callback(output.save.unlink, missing_ok=True)
         process = _draw_on(stack, output, source_of, drawing)
         try:
             with progress() as tell:
                 source = source_of.start(stack, stop, tell)
         except BringUpCancelled:
             return None
+        unused.pop_all()
         return _show(output, process, source, stop, drawing)
 
 

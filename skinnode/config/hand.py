@@ -91,7 +91,8 @@ class HandConfig(Table):
             channel: New channel for the bus; None to keep the channel in the file.
 
         Raises:
-            ConfigError: A channel is given for a hand with several buses, or a name is empty.
+            ConfigError: A channel is given for a hand with several buses, two buses would have the same
+                channel, or a name is empty.
         """
         if channel is not None and len(self.buses) > 1:
             raise ConfigError(
@@ -102,6 +103,9 @@ class HandConfig(Table):
         for key, value in kept.items():
             if not value:
                 raise ConfigError(f"--{key}", value, "a name")
+        if interface is not None and len({bus.channel for bus in self.buses}) < len(self.buses):
+            allowed = "only for a hand whose buses have different channels"
+            raise ConfigError("--interface", interface, allowed)
         return self.model_copy(update={"buses": tuple(bus.model_copy(update=kept) for bus in self.buses)})
 
     def without_layout_files(self) -> HandConfig:

@@ -46,7 +46,7 @@ class Pdo:
         return f"{'TPDO' if self.transmits else 'RPDO'}{self.parameter % 0x200 + 1}"
 
 
-class Unsupported(Exception):
+class Unsupported(NotApplicable):
     """Raised if a PDO does not support an optional sub-index, a transmission type or remote frames."""
 
 
@@ -111,9 +111,11 @@ def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
         The CAN-ID of the PDO.
 
     Raises:
-        Unsupported: The device refuses a parameter.
+        Unsupported: The device refuses a parameter, or the PDO has no CAN-ID.
     """
     cob_id = disable(dut, pdo)
+    if not cob_id & CAN_ID:  # the PDO would be sent with the CAN-ID of NMT commands
+        raise Unsupported(f"{pdo} has no CAN-ID")
     _set(dut, pdo, KIND, parameters.kind, 1)
     for subindex, value, size in (
         (INHIBIT, parameters.inhibit_100us, 2),

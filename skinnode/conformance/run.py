@@ -118,10 +118,10 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
             results.append(result)
             say(result)
             problems += _put_back(dut, before)
-    finally:
+    finally:  # also if the user interrupts the run
         problems += _put_back(dut, before)
-    if silent < SILENT_CASES:
-        _reset(dut)
+        if silent < SILENT_CASES:
+            _reset(dut)
     return Report(tuple(results), tuple(dict.fromkeys(problems)), dut.eds.source)
 
 
@@ -149,12 +149,13 @@ def run_case(dut: Dut, case: Case) -> Result:
 def _put_back(dut: Dut, before: dict[tuple[int, int], bytes]) -> list[str]:
     if not dut.stored:
         return []
-    dut.stored = False
     try:
         dut.prepare()
-        return write_back(dut, before)
+        problems = write_back(dut, before)
     except (Failed, NodeTimeout) as failure:
-        return [f"the configuration could not be restored: {failure}"]
+        problems = [f"the configuration could not be restored: {failure}"]
+    dut.stored = False  # not if the user interrupts the restoration: it is then done again
+    return problems
 
 
 def _reset(dut: Dut) -> None:

@@ -15,11 +15,15 @@ from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
 from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
-from skinnode.host.sdo_client import RemoteOd
+from skinnode.host.sdo_client import Abandoned, RemoteOd
 from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum wait for a heartbeat, in s. Heartbeats with a longer period are missed."""
+"""Maximum wait for a heartbeat whose period is unknown, in s. Heartbeats with a longer period are missed."""
+
+LONGEST_KNOWN_HEARTBEAT_S: Final = 15.1
+"""Maximum wait for a heartbeat whose period is known, in s. It suffices for the longest period that a hand
+file can set, 10 s."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
 """Maximum times to wait for the responses to the first and the second remote frame, in s.
@@ -84,7 +88,7 @@ class BusConnection(Closing):
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """End the SDO transfers in all threads; each transfer raises Abandoned."""
+        """End the SDO transfers and waits in all threads; each of them raises Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
@@ -99,6 +103,7 @@ class BusConnection(Closing):
 
         Raises:
             BusError: The bus failed during the wait.
+            Abandoned: :meth:`abandon` has been called.
         """
         end_s = time.monotonic() + within_s
         while not condition():
@@ -106,6 +111,8 @@ class BusConnection(Closing):
                 raise self.defect
             if self.link.failure is not None:
                 raise BusError(str(self.link.failure)) from self.link.failure
+            if self._abandoned.is_set():
+                raise Abandoned
             if time.monotonic() > end_s:
                 return False
             time.sleep(_POLL_S)
@@ -176,8 +183,10 @@ class BusConnection(Closing):
             since_ns: Heartbeats received before this time (monotonic clock, ns) are ignored.
         """
         if heartbeat_s != 0:
-            wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1
-            beat = self._beat(node_id, since_ns, min(wait_s, LONGEST_HEARTBEAT_S))
+            wait_s = LONGEST_HEARTBEAT_S
+            if heartbeat_s is not None:
+                wait_s = min(1.5 * heartbeat_s + 0.1, LONGEST_KNOWN_HEARTBEAT_S)
+            beat = self._beat(node_id, since_ns, wait_s)
             if beat is not None:
                 return State(beat.state, "heartbeat")
             if heartbeat_s:

@@ -70,6 +70,7 @@ def collect_facts(
         bus.interface,
         bus.channel,
         bus.bitrate_bps,
+        max_load=bus.max_load,
         period_s=None if hand is None else hand.sync.period_s,
         heartbeat_ms=None if hand is None else hand.bring_up.heartbeat_ms,
         role=bus.role,

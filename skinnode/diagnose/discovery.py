@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.bus_load.timing import worst_case_bits
 from skinnode.canopen import indices as od
 from skinnode.canopen.lss import LssAddress
 from skinnode.canopen.sdo import upload_request
@@ -22,7 +23,12 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests in a sweep, in s. At 1 Mbit/s, the requests use one sixth of the bus capacity."""
+"""Minimum interval between requests in a sweep, in s. At 1 Mbit/s, the requests use one sixth of the bus
+capacity."""
+
+PACE_FRAMES: Final = 3
+"""Interval between requests at a low bit rate, in frames: a request, its response and one other frame. With
+shorter intervals, requests would wait until their responses are too late or the send buffer is full."""
 
 ANSWER_S: Final = 0.12
 """Time to wait for responses after the last request in a sweep, in s."""
@@ -185,12 +191,13 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
 def _sweep(connection: BusConnection) -> dict[int, int]:
     """Request the device type from all node-IDs; return the number of responses by node-ID."""
     answers: dict[int, int] = {}
+    pace_s = max(PACE_S, PACE_FRAMES * worst_case_bits(8) / connection.bus.bitrate_bps)
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()
         for node_id in range(1, od.MAX_NODE_ID + 1):
             if node_id not in answers:
                 connection.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE)
-                time.sleep(PACE_S)
+                time.sleep(pace_s)
         connection.wait_until(lambda: False, ANSWER_S)
         for node_id, heard in connection.listener.nodes.items():
             count = sum(

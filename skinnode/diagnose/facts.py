@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.canopen.lss import LssAddress
-from skinnode.config import PatchConfig
+from skinnode.config import MAX_BUS_LOAD, PatchConfig
 from skinnode.diagnose.bus_listener import Emergency
 from skinnode.diagnose.discovery import FoundNode
 from skinnode.diagnose.node_info import NodeInfo
@@ -122,6 +122,8 @@ class BusFacts:
     load: float = 0.0
     """Bus load (fraction) in the busiest second of the capture, or in the last second if nothing was
     captured."""
+    max_load: float = MAX_BUS_LOAD
+    """Maximum planned bus load (fraction) from the hand file."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0

@@ -53,7 +53,9 @@ def write_bytes(option: str, file: Path, data: bytes) -> None:
         if file.exists() and not (file.is_file() and os.access(target.parent, os.W_OK)):
             file.write_bytes(data)
         else:
-            mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o666
-            replace_file(target, data, mode=mode)
+            if target.exists():
+                replace_file(target, data, mode=stat.S_IMODE(target.stat().st_mode), masked=False)
+            else:
+                replace_file(target, data, mode=0o666)
     except OSError as error:
         raise ConfigError(option, str(file), f"a file that can be written ({error.strerror})") from error

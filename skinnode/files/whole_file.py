@@ -18,13 +18,16 @@ SUFFIX: Final = ".new"
 """Suffix of temporary files."""
 
 
-def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
+def replace_file(
+    path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False, masked: bool = True
+) -> None:
     """Replace the content of a file atomically. A symbolic link is replaced, not followed.
 
     Args:
         path: The file; it need not exist.
         data: New content.
-        mode: Permissions of the file, reduced by the umask.
+        mode: Permissions of the file.
+        masked: Whether the umask reduces ``mode``, as for a new file.
         durable: Whether to flush the file and its folder to the storage medium before returning.
 
     Raises:
@@ -32,6 +35,8 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
     """
     beside = create_beside(path, data, mode=mode, durable=durable)
     try:
+        if not masked:
+            os.chmod(beside, mode)
         os.replace(beside, path)
     except BaseException:
         discard(beside)

@@ -47,7 +47,7 @@ supervisor  the state of a patch            the patch is faulty             patc
 supervisor  the master's heartbeat          one heartbeat on that bus       with the next
 rejoin      SDO                             that transfer                   tried three times
 rejoin      bring-up, baseline, register    the patch is faulty             patch brought up again
-rejoin      search by LSS                   that search                     after a second
+search      search by LSS                   that search                     after a second
 bring-up    a node, at the start            that attempt                    tried three times
 health      patches, buses, defects         one check of them               50 ms later; events may repeat
 health      a subscriber of events          that subscriber's event         with the next

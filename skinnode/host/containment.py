@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -93,6 +93,15 @@ class Defects:
         failure.__cause__ = error
         with contextlib.suppress(Exception):
             self._on_new(failure)
+
+
+def stats_by_subject(records: Iterable[Defects]) -> dict[str, DefectStats]:
+    """Return the statistics of records by subject. Records of a patch and a bus with one name are added."""
+    found: dict[str, DefectStats] = {}
+    for record in records:
+        stats, other = record.stats(), found.get(record.subject, DefectStats(0, None))
+        found[record.subject] = DefectStats(other.count + stats.count, stats.newest or other.newest)
+    return found
 
 
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:

@@ -12,7 +12,7 @@ from skinnode.config import BusConfig, HandConfig, load_hand
 from skinnode.errors import CodecError, NodeError
 from skinnode.host import nmt_master
 from skinnode.host.configurator import BOOT_DEADLINE_S
-from skinnode.host.containment import DefectStats
+from skinnode.host.containment import DefectStats, stats_by_subject
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.health import BusHealth, PatchHealth, faults_of
 from skinnode.host.health_watch import HealthWatch
@@ -224,7 +224,7 @@ class Host(RunningHand):
     def _all_defects(self) -> dict[str, DefectStats]:
         of_buses = [bus.link.defects for bus in self._buses.values()]
         of_patches = [node.defects for node in self._nodes.values()]
-        return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
+        return stats_by_subject((self._defects, *of_buses, *of_patches))
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
         """Record all traffic from now on with ``tap``. Only one tap may be active at a time.
@@ -291,6 +291,7 @@ class Host(RunningHand):
             raise NodeError(
                 node.patch.node_id, f"another master runs {node.patch.bus}; it must reset the node"
             )
+        node.monitor.expect_boot_up(clock.monotonic_ns())
         nmt_master.reset(node.link.send, node.patch.node_id)
 
     def stats(self) -> HostStats:

@@ -36,6 +36,9 @@ LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
 """Definition of a restart loop: ``LOOP_RESTARTS`` restarts without a command within ``LOOP_NS`` (ns)."""
 
+RESET_NS: Final = 5_000_000_000
+"""Time (ns) after the host's reset command within which the node's next boot-up message is expected."""
+
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
 """Test for two nodes with the same node-ID: ``BEATS`` heartbeats arrive in less than ``BEATS_TOO_OFTEN``
@@ -46,7 +49,8 @@ times the time that a single node needs to send them.
 class NodeMonitor:
     """Collector of evidence about one node.
 
-    Threads: any thread may call :meth:`health`. Only the mainline may call the other methods.
+    Threads: any thread may call :meth:`health` and :meth:`expect_boot_up`. Only the mainline may call the
+    other methods.
 
     Args:
         patch: Name of the patch.
@@ -75,9 +79,10 @@ class NodeMonitor:
         self._registers_said = 0
         self._last_emergency: tuple[int, bytes] | None = None  # error code, other bytes
         self.running = False
-        """Whether the host has started the node. From then on, a boot-up message means a restart without a
-        command.
+        """Whether the host has started the node. From then on, an unexpected boot-up message means a restart
+        without a command.
         """
+        self._expected_until_ns = 0
         self.rejoins = self.baselines = 0
         self.refusal: str | None = None
         self.defect: str | None = None
@@ -108,14 +113,25 @@ class NodeMonitor:
         state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
         if state == NmtState.INITIALISING:
             self._boot_ups += 1
+            self.forget_beats()
             self._on_register(0)  # a reset clears the register; the node reports persisting errors again
-            if self.running:
+            if t_ns <= self._expected_until_ns:
+                self._expected_until_ns = 0
+            elif self.running:
                 self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted without a command", self.node_id, self.patch)
         else:
             self._beats.append(t_ns)
         self.nmt_state = state
         self._t_heartbeat_ns = t_ns
+
+    def expect_boot_up(self, now_ns: int) -> None:
+        """Expect a boot-up message, because the host resets the node at monotonic time ``now_ns``."""
+        self._expected_until_ns = now_ns + RESET_NS
+
+    def forget_beats(self) -> None:
+        """Forget the heartbeats received so far, because their period may have changed."""
+        self._beats = deque(maxlen=BEATS)  # a new one, because other threads read the old one
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY message.

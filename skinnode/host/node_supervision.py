@@ -42,11 +42,12 @@ _MUTE_NS: Final = 1_000_000_000
 class NodeSupervision:
     """State machines of all supervised nodes. Used only by the supervisor's thread.
 
-    A job that has to wait for a node runs on ``pool``. A node has at most one job at a time.
+    A job that has to wait for a node runs on ``pool``. A node has at most one job at a time. LSS searches run
+    on ``searches``.
     """
 
-    def __init__(self, pool: Executor) -> None:
-        self._pool = pool
+    def __init__(self, pool: Executor, searches: Executor) -> None:
+        self._pool, self._searches = pool, searches
         self._baselines = BaselineWatch(pool)
 
     def look(self, node: Supervised, now_ns: int) -> None:
@@ -92,7 +93,7 @@ class NodeSupervision:
         search_is_over = node.searching is None or node.searching.done()
         if remote.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
             node.search_ns = now_ns
-            node.searching = self._pool.submit(_search, remote)
+            node.searching = self._searches.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
         """Start configuring a node.

@@ -155,7 +155,9 @@ class PatchStream:
         self.withholdings = 0
         """Number of calls to :meth:`withhold`."""
         self.doubtful = False
-        """Whether a lost or discarded summary may have announced a new baseline."""
+        """Whether a summary that was lost or discarded, or a scan that was missed, may have announced a new
+        baseline."""
+        self._next_scan: int | None = None  # number of the next scan if none is missed; None before the first
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
@@ -227,7 +229,7 @@ class PatchStream:
         if withholdings != self.withholdings:
             return
         self._solver = solver
-        self.doubtful = False
+        self.doubtful, self._next_scan = False, None
         checked = solver.facts.checked
         if anew:
             self._assembler.reset(under_way=self._options.under_way, checked=checked)
@@ -261,8 +263,9 @@ class PatchStream:
         self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
         if scan.flags & _BASELINE_CHANGED:  # the first scan encoded with the new baseline
             self.withhold()
-        elif scan.device_time_us is None:
+        elif scan.device_time_us is None or (self._next_scan is not None and scan.scan > self._next_scan):
             self.doubtful = True
+        self._next_scan = scan.scan + 1
         solver = self._solver
         if solver is None:
             self._withheld += 1

@@ -109,7 +109,7 @@ class Subscription(Closing):
         except TimeoutError:
             if not limit.expired():  # the error that stopped the host is a TimeoutError
                 raise
-            raise queue.Empty from None
+            return self._open(self._queue.get(0.0))  # a field may have been waiting from the start
         finally:
             del self._wakers[key]
 

@@ -151,6 +151,7 @@ class RemoteNode:
         # Scans of a node that another master runs have been arriving since the bus was opened, unless the
         # node has booted since.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
+        self.link.call(self.monitor.forget_beats, self.defects)
         self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
         if not self.has_other_master:
             nmt_master.start(self.link.send, self.patch.node_id)

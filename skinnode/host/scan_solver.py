@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -142,21 +143,12 @@ def check_solvable(patch: PatchConfig, config: SolverConfig, period_s: float) ->
         period_s: SYNC period (s) of the hand. The thresholds of the touch tests depend on it.
 
     Raises:
-        ConfigError: if the solver cannot compute displacements for the layout.
+        ConfigError: if the solver cannot compute displacements for the layout, or its options conflict.
     """
     layout = patch.layout.build()
     try:
-        made = tracker_options(patch, config, relative_noise=patch.relative_noise).tolerances
-        tracker = Tracker(
-            layout,
-            method=config.method,
-            operator=config.operator,
-            relative_noise=patch.relative_noise,
-            tolerances=made,
-            detect=config.detect,
-            false_alarms_per_hour=config.false_alarms_per_hour,
-            scan_period_s=period_s,
-        )
+        options = tracker_options(patch, config, relative_noise=patch.relative_noise, period_s=period_s)
+        tracker = Tracker(layout, dataclasses.replace(options, deadline_us=None))  # not while compiling
         tracker.update(resistance_ohm(layout, layout.upper_m))
         tracker.prepare()
     except ValueError as error:

@@ -5,8 +5,9 @@ of one node does not depend on the others.
 
 Fifty times a second, the supervisor's thread evaluates the mainline's information about each node and decides
 what to do. Any operation that waits for a node, such as its configuration, runs as a job on a thread pool. A
-node has at most one job at a time. The supervisor's thread also collects the results of the jobs, so that no
-other thread accesses its state.
+node has at most one job at a time. LSS searches for absent nodes, of which a bus carries only one at a time,
+have threads of their own, so that no other job waits for them. The supervisor's thread also collects the
+results of the jobs, so that no other thread accesses its state.
 
 =========  ========================================  =========================================
 phase      meaning                                   next phase
@@ -92,7 +93,9 @@ class Supervisor(Closing):
         self._defects = defects
         self._stop = clock.event()
         self._pool = clock.pool(min(THREADS, len(self._nodes)), "rejoin")
-        self._supervision = NodeSupervision(self._pool)
+        buses = {remote.link.config.name for remote in nodes}
+        self._searches = clock.pool(min(THREADS, len(buses)), "search")
+        self._supervision = NodeSupervision(self._pool, self._searches)
         self._thread = clock.thread(target=self._run, name="supervisor")
         self._thread.start()
 
@@ -111,7 +114,8 @@ class Supervisor(Closing):
         self._thread.join()
         for node in self._nodes:
             node.abandon.set()
-        self._pool.shutdown(cancel_futures=True)
+        for pool in (self._pool, self._searches):
+            pool.shutdown(cancel_futures=True)
 
     # --- supervisor's thread
 

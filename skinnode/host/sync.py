@@ -63,8 +63,23 @@ class Ticks:
         return (number - 1) % self.counter_overflow + 1
 
     def find(self, counter: int) -> Tick | None:
-        """Return the newest SYNC with this counter value; None if there has been none."""
-        return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
+        """Return the SYNC of a scan that has just arrived; None if no SYNC has had the scan's counter value.
+
+        If the SYNC was lost, the newest one with this counter value is older than the scan by a round of the
+        counter. The result then has the right number and the time 0. A SYNC that would be more than three
+        quarters of a round old is regarded as the lost SYNC of the next round.
+        """
+        overflow = self.counter_overflow
+        tick = self._ticks[counter] if 0 < counter <= overflow else None
+        if tick is None:
+            return None
+        most = overflow - overflow // 4
+        newest = self.newest
+        age = newest - tick.number
+        if age < most:
+            return tick
+        age %= overflow
+        return Tick(newest - age + (overflow if age >= most else 0), 0)
 
 
 class SyncFollower:

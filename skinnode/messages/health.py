@@ -11,6 +11,7 @@ from skinnode.host.events import HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.open_and_shorted_wires import WireFault
 from skinnode.messages.typestore import header, message_type, time_of
+from skinnode.transport.bus_state import BusState
 
 DIAGNOSTIC_ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
 LOG: Final = "rcl_interfaces/msg/Log"
@@ -52,23 +53,30 @@ def diagnostics(
         )
         for name, health in patches.items()
     ]
-    statuses += [
-        make(
-            level=OK if bus.away is None and not bus.no_sync else ERROR,
-            name=f"{hand}: {name}",
-            message=bus.away or ("no SYNC" if bus.no_sync else "available"),
-            hardware_id=name,
-            values=_values(bus),
-        )
-        for name, bus in buses.items()
-    ]
+    for name, bus in buses.items():
+        level, text = _judged(bus)
+        statuses.append(make(level, f"{hand}: {name}", text, name, _values(bus)))
     return message_type(DIAGNOSTIC_ARRAY)(header(t_ns, ""), statuses)
 
 
 def level_of(health: PatchHealth) -> int:
-    """Return a patch's diagnostic level; WARN for an operational patch with faulty wires or readings."""
-    level = _LEVEL.get(health.condition, ERROR)
+    """Return a patch's diagnostic level; WARN for an operational patch with faulty wires or readings.
+
+    Two nodes with the same node-ID are an error, as in ``skinnode monitor``.
+    """
+    level = ERROR if health.duplicate_id else _LEVEL.get(health.condition, ERROR)
     return WARN if level == OK and (health.wires or health.faults or health.life) else level
+
+
+def _judged(bus: BusHealth) -> tuple[int, str]:
+    """Return the diagnostic level of a bus and its reason."""
+    if bus.away is not None:
+        return ERROR, bus.away
+    if bus.no_sync:
+        return ERROR, "no SYNC"
+    if bus.controller not in (None, BusState.ACTIVE):
+        return ERROR if bus.controller is BusState.OFF else WARN, f"the controller is {bus.controller}"
+    return OK, "available"
 
 
 def log_message(event: HealthEvent, t_ns: int) -> Any:

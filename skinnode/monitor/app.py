@@ -130,7 +130,9 @@ class MonitorApp(App[None]):
         self._turn()
 
     def on_unmount(self) -> None:
-        """Remove the logging handler that adds warnings to the event log."""
+        """End the recording, and remove the logging handler that adds warnings to the event log."""
+        if self._source.recording is not None:
+            self._source.stop_recording()  # the source then tells what the recording lacks
         logging.getLogger().removeHandler(self._records)
 
     @property

@@ -11,10 +11,12 @@ from skinnode.host import Host, RunningHand, Subscription
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import HealthEvent
 from skinnode.host.patch_stream import StreamStats
-from skinnode.monitor.source import QUEUED_EVENTS, Arrivals, Recording, Snapshot, drain
+from skinnode.model.layout import PatchLayout
+from skinnode.monitor.source import QUEUED_EVENTS, Arrivals, Recording, Snapshot, drain, supplied_m
 from skinnode.process import clock
 from skinnode.process.closing import Closing
 from skinnode.record import Recorder
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from skinnode.remote import RemoteHand
@@ -46,6 +48,10 @@ class LiveSource(Closing):
     def fields(self, capacity: int) -> Subscription:
         """Subscribe to the fields of all patches."""
         return self._running.fields(capacity=capacity)
+
+    def layout(self, patch: str) -> PatchLayout:
+        """Return the electrode layout used to compute a patch's fields."""
+        return self._running.layout(patch)
 
     def now_ns(self) -> int:
         """Return the current time in ns."""
@@ -95,6 +101,7 @@ class LiveSource(Closing):
             arrivals=arrivals,
             buses=buses,
             streams=streams,
+            supplied_m=supplied_m(self.hand, running.layout),
             away=away,
         )
 
@@ -112,6 +119,7 @@ class HostSource(LiveSource):
     def __init__(self, host: Host) -> None:
         super().__init__(host, host.hand.name)
         self._host = host
+        self._lost: list[str] = []  # what the ended recordings lack
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
@@ -120,6 +128,11 @@ class HostSource(LiveSource):
         stats = self._host.stats()
         arrivals = {name: Arrivals(stream.solved) for name, stream in stats.patches.items()}
         return self._snapshot(arrivals, stats.buses, stats.patches)
+
+    @property
+    def flaws(self) -> list[str]:
+        """Failures of the recordings that have ended, and the numbers of frames that they lack."""
+        return list(self._lost)
 
     @property
     def recording(self) -> Recording | None:
@@ -144,6 +157,10 @@ class HostSource(LiveSource):
         recorder.close()
         ended = self.recording
         assert ended is not None
+        if ended.failure is not None:
+            self._lost.append(ended.failure)
+        if ended.dropped:
+            self._lost.append(f"{ended.path}: {counted(ended.dropped, 'frame')} not recorded")
         self._recorder = self._untap = None
         return ended
 

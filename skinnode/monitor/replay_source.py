@@ -11,7 +11,8 @@ from skinnode.host import PatchHealth, Subscription
 from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth
 from skinnode.host.health_watch import HealthWatch
-from skinnode.monitor.source import QUEUED_EVENTS, Arrivals, Recording, Snapshot, drain
+from skinnode.model.layout import PatchLayout
+from skinnode.monitor.source import QUEUED_EVENTS, Arrivals, Recording, Snapshot, drain, supplied_m
 from skinnode.process.closing import Closing
 from skinnode.record import Replay
 
@@ -55,6 +56,10 @@ class ReplaySource(Closing):
     def fields(self, capacity: int) -> Subscription:
         """Subscribe to the fields of all patches."""
         return self._run.publisher.subscribe(capacity, None, None)
+
+    def layout(self, patch: str) -> PatchLayout:
+        """Return the electrode layout used to compute a patch's fields."""
+        return self._run.layout(patch)
 
     def now_ns(self) -> int:
         """Return the current replay time in ns on the recording host's monotonic clock."""
@@ -106,6 +111,7 @@ class ReplaySource(Closing):
         try:
             for _ in self._run:
                 pass
+            self._running.close()  # checks the health once more, so that no event follows the end
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
         except Exception as error:  # also report unexpected exceptions to the user
@@ -127,6 +133,7 @@ def snapshot_of(run: Replay) -> Snapshot:
         arrivals={name: Arrivals(stream.solved) for name, stream in streams.items()},
         buses=run.bus_stats(),
         streams=streams,
+        supplied_m=supplied_m(run.hand, run.layout),
     )
 
 

@@ -6,7 +6,7 @@ and never block the host.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -18,6 +18,7 @@ from skinnode.host.events import EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth
 from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float, PatchLayout
 
 QUEUED_EVENTS: Final = 500
 """Maximum number of events queued between two screen updates."""
@@ -48,6 +49,8 @@ class Snapshot:
     """Counters of each bus; empty for a remote hand, whose daemon does not send them."""
     streams: Mapping[str, StreamStats]
     """Counters of each patch; empty for a remote hand, whose daemon does not send them."""
+    supplied_m: Mapping[str, Float]
+    """See :func:`supplied_m`."""
     away: str | None = None
     """Reason why no data is arriving from a remote hand's daemon; None while data is arriving."""
 
@@ -82,6 +85,9 @@ class Source(Protocol):
     def fields(self, capacity: int) -> Subscription:
         """Subscribe to the fields of all patches; the queue keeps the newest ``capacity`` fields."""
 
+    def layout(self, patch: str) -> PatchLayout:
+        """Return the electrode layout used to compute a patch's fields."""
+
     def now_ns(self) -> int:
         """Return the current time in ns on the monotonic clock used in snapshots."""
 
@@ -95,7 +101,7 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Descriptions of missing or unreadable data found so far in a recording."""
+        """Descriptions of missing or unreadable data in the replayed recording or in the recordings made."""
 
     @property
     def no_commands(self) -> str | None:
@@ -123,6 +129,23 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Release the source's resources."""
+
+
+def supplied_m(hand: HandConfig, layout: Callable[[str], PatchLayout]) -> dict[str, Float]:
+    """Return the electrode positions of the patches that supply them (``coordinates = "node"``).
+
+    The hand file contains the positions of the other patches.
+
+    Args:
+        hand: The hand.
+        layout: Function that returns the layout used to compute a patch's fields.
+
+    Returns:
+        (U, N, 3) positions at rest by patch name, in m; as planned until the node has supplied its own.
+    """
+    return {
+        patch.name: layout(patch.name).upper_m for patch in hand.patches if patch.layout.coordinates == "node"
+    }
 
 
 def drain(subscription: EventSubscription) -> list[HealthEvent]:

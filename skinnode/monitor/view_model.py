@@ -176,7 +176,8 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
     condition, level, words = judge_patch(health, _recent_losses(name, now, before))
     if now.away is not None:
         words = ("daemon away",)  # the other faults are out of date
-    surface = None if field is None else surface_of(field, upper_m(patch.layout))
+    rest_m = now.supplied_m[name] if name in now.supplied_m else upper_m(patch.layout)
+    surface = None if field is None else surface_of(field, rest_m)
     depth_m = depth_std_m = None
     if field is not None and surface is not None:
         known = np.where(surface.unknown, -np.inf, surface.depth_m)
@@ -208,7 +209,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
         depth_m=depth_m,
         depth_std_m=depth_std_m,
         shear_m=(0.0, 0.0) if surface is None else mean_shear_m(surface),
-        touches=() if field is None else touches_of(field, upper_m(patch.layout)),
+        touches=() if field is None else touches_of(field, rest_m),
     )
 
 
@@ -226,10 +227,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return the (U, N, 3) electrode positions at rest, in m, according to the hand file.
-
-    The positions stored in the patch may differ.
-    """
+    """Return the (U, N, 3) electrode positions at rest, in m, according to the hand file."""
     return layout.build().upper_m
 
 
@@ -250,10 +248,9 @@ def judge_patch(health: PatchHealth, lossy: Sequence[str]) -> tuple[str, Level, 
         health: Health of the patch.
         lossy: Descriptions of its recent losses.
     """
-    condition = health.condition
+    condition, words = health.condition, _faults(health)
     if condition is Condition.STALE and health.scan_age_s is None:
-        return "starting", "note", ()
-    words = _faults(health)
+        return "starting", "note", tuple(words)
     if condition is not Condition.OPERATIONAL:
         lossy = []  # the condition already explains these losses
     level: Level = "good"
@@ -272,6 +269,8 @@ def _faults(health: PatchHealth) -> list[str]:
         words.append(health.refusal)
     if health.defect:
         words.append(health.defect)
+    if health.complaint and health.condition is not Condition.OPERATIONAL and health.complaint not in words:
+        words.append(health.complaint)
     if health.duplicate_id:
         words.append(f"two nodes have node-ID {health.node_id}")
     if health.restarts_in_a_loop:

@@ -24,8 +24,12 @@ class Application(Protocol):
         """Start the application at power-on, before the boot-up message. Not called on a reset."""
         ...
 
-    def reset(self) -> None:
-        """Reset the application. Its objects already have their power-on values."""
+    def reset(self, *, everything: bool) -> None:
+        """Restart the application's communication at power-on and after a reset.
+
+        If ``everything`` is true, reset its state, too: at power-on and after *reset node*, its objects
+        already have their power-on values. *Reset communication* keeps them.
+        """
         ...
 
     def enter(self, *, operational: bool) -> None:

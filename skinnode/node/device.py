@@ -18,6 +18,7 @@ from skinnode.canopen.dictionary import Object
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress
 from skinnode.canopen.nmt import NmtCommand, NmtState
+from skinnode.errors import BusError
 from skinnode.node.application import Application, ApplicationServices
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.error_control import ErrorControl
@@ -81,13 +82,13 @@ class CanopenDevice:
         self._default_node_id = node_id
         self.node_id = node_id
         """Active node-ID; 255 while the device has no node-ID."""
-        self._send = send
+        self._send_frame = send
         self._now_ns = 0
         self._store = ObjectStore(objects, node_id)
         self._sdo = SdoServer(self._store, self._send_sdo)
         self._rejected = RejectedFrames(self._store)
-        self._emcy = EmcyProducer(self._store, send)
-        services = NodeServices(self._store, self._emcy, self._rejected, send, self._now)
+        self._emcy = EmcyProducer(self._store, self._send)
+        services = NodeServices(self._store, self._emcy, self._rejected, self._send, self._now)
         self._nmt = NmtSlave(self._store, self._rejected, self._entered)
         self._storage = Storage(services, memory, kind)
         self._set_bit_rate = set_bit_rate
@@ -223,6 +224,12 @@ class CanopenDevice:
     def _now(self) -> int:
         return self._now_ns
 
+    def _send(self, can_id: int, data: bytes) -> None:
+        """Send a frame. During a bit rate change, raise BusError: an emergency message then stays queued."""
+        if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
+            raise BusError(f"0x{can_id:03X} not sent: the bit rate is being changed")
+        self._send_frame(can_id, data)
+
     # --- states
 
     @property
@@ -260,7 +267,7 @@ class CanopenDevice:
         self._tpdos.restore()
         self._rpdos.restore()
         self._sync.reload()
-        self._application.reset()
+        self._application.reset(everything=objects == EVERYTHING)
         self._reload()
         self._error_control.boot_up(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)

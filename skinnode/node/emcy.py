@@ -102,7 +102,9 @@ class EmcyProducer:
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
             if self._lost:  # the dropped messages were the oldest
-                self._send(cob_id, self._loss())
+                detail = self._loss()
+                self._send(cob_id, self._loss_message(detail))
+                self._remember(EmcyCode.CAN_OVERRUN, detail)  # not at each attempt to send it
                 self._lost = 0
             else:
                 self._send(cob_id, self._waiting[0])
@@ -146,13 +148,14 @@ class EmcyProducer:
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """Return an emergency message (0x8110) that reports the number of dropped emergency messages.
+        """Return the detail bytes of the emergency message (0x8110) that reports dropped emergency messages.
 
-        The number is in detail bytes 2 and 3. Detail bytes 0 and 1 are 0 to distinguish this message from one
-        about skipped scans, in which they contain the number of skipped scans.
+        Their number is in detail bytes 2 and 3. Detail bytes 0 and 1 are 0 to distinguish this message from
+        one about skipped scans, in which they contain the number of skipped scans.
         """
-        detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
-        self._remember(EmcyCode.CAN_OVERRUN, detail)
+        return struct.pack("<HH", 0, min(self._lost, 0xFFFF))
+
+    def _loss_message(self, detail: bytes) -> bytes:
         return _message(EmcyCode.CAN_OVERRUN, self.register | EmcyCode.CAN_OVERRUN.register_bit | 1, detail)
 
     @property

@@ -135,9 +135,10 @@ class Storage:
                 for key, value in group.values.items()
                 if first <= key[0] <= last
             }
-        for index, subindex in write_configuration(self._store, values):
+        refused = write_configuration(self._store, values)
+        for index, subindex in refused:
             self.note(Fault.REFUSED, index, subindex)
-        if self._present(*APPLICATION) != self._kept.application.values:
+        if refused or self._present(*APPLICATION) != self._kept.application.values:
             self._clear_verification()  # this is not the configuration that was verified
 
     def keep_baseline(self) -> None:

@@ -169,16 +169,16 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     good = np.isfinite(baseline) & (baseline > 0)
     if not good.all():
         raise ValueError(f"baseline_ohm: got {baseline[~good][0]:g}, must be positive")
-    own = table["layout"]
-    if own is None:
-        layout = patch.layout.build()
-    else:
-        layout = PatchLayout(
+    own, layout = table["layout"], patch.layout.build()
+    if own is not None:
+        supplied = PatchLayout(
             np.array(own["upper_m"], dtype=np.float64),
             np.array(own["lower_m"], dtype=np.float64),
             own["resistivity_ohm_per_m"],
             own["name"],
         )
+        if patch.layout.coordinates == "node":  # skinnode resolve can set "preset" instead
+            layout = supplied
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
     checked = table.get("checked", False)  # missing from journals that predate the check
     if not isinstance(checked, bool):

@@ -46,7 +46,8 @@ SYNC_S: Final = 1.0
 fsync call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum number of queued batches of frames, enough for several seconds on four fully loaded buses."""
+"""Maximum number of queued entries with frames or fields, enough for several seconds on four fully loaded
+buses."""
 
 _Job = Callable[[], None]
 
@@ -228,8 +229,13 @@ class Recorder:
                     self._made.rmdir()
 
     def _put(self, entry: _Entry) -> None:
-        """Queue an entry, or count it as lost."""
-        if self._failure is not None or self._queue.qsize() >= CAPACITY:
+        """Queue an entry, or count it as lost.
+
+        A full queue still accepts journal events, which are few: without them, a replay would decode the
+        later scans with an old baseline.
+        """
+        refused = (entry.frames or entry.fields) and self._queue.qsize() >= CAPACITY
+        if self._failure is not None or refused:
             self._lost += entry.frames
             self._fields_lost += entry.fields
         elif self._thread.is_alive():

@@ -235,8 +235,11 @@ class Replay:
 
     def health(self, patch: str) -> PatchHealth:
         """Return the health of a patch at the current replay time. Raises KeyError for an unknown patch."""
-        heard = self._buses[self.hand.patch(patch).bus].patches[patch]
-        health = heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
+        bus = self._buses[self.hand.patch(patch).bus]
+        solver = bus.solver(patch)
+        # on a bus that another master runs, the nodes may have another heartbeat period than in the hand file
+        heartbeat_s = self.hand.bring_up.heartbeat_s if solver is None else solver.facts.heartbeat_s
+        health = bus.patches[patch].monitor.health(self._now_ns, heartbeat_s, self.hand.sync.period_s)
         return replace(health, faults=faults_of(self._publisher.latest(patch)))
 
     def bus_stats(self) -> dict[str, BusStats]:

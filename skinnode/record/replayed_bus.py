@@ -147,18 +147,21 @@ class ReplayedBus:
         return bool(event["t_ns"] <= t_ns)
 
     def _happen(self, event: dict[str, Any]) -> None:
-        stream = self.patches[event["patch"]].stream
+        heard = self.patches[event["patch"]]
+        stream = heard.stream
         match event["event"]:
             case "withheld":
                 stream.withhold()
             case "polled":
                 stream.poll(event["t_ns"] + _ROUNDING_NS)
             case "resumed":
-                solver = self._solver(event)
+                solver, anew = self._solver(event), bool(event.get("anew"))
+                if anew:  # the host has set the heartbeat period
+                    heard.monitor.forget_beats()
                 if solver is None:
                     stream.withhold()
                 else:
-                    stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
+                    stream.resume(solver, stream.withholdings, anew=anew)
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
         """Return the solver for a journal event; None if the node facts are unknown or unusable."""

@@ -5,6 +5,7 @@ If a worker is lost, Dask runs its unit again on another worker.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -86,9 +87,10 @@ class Cluster(Closing):
 
     def submit(self, unit: Unit) -> None:
         """Run a unit as soon as a worker is free."""
-        future = self._client.submit(
-            _run_here, unit, str(self._folder), self._identity, key=f"skinnode-{unit.key}", pure=False
-        )
+        folder = str(self._folder)
+        # another command on this cluster may run the same unit, but for its own work folder
+        key = f"skinnode-{unit.key}-{hashlib.sha256(folder.encode()).hexdigest()[:8]}"
+        future = self._client.submit(_run_here, unit, folder, self._identity, key=key, pure=False)
         self._futures[future] = unit
 
     def finished(self, timeout_s: float) -> Sequence[str]:

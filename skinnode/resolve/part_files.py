@@ -55,7 +55,7 @@ class PartFiles:
             OSError: The file cannot be written.
         """
         path = self._path(key)
-        temporary = beside(path)
+        temporary = self.temporary(path.name)
         try:
             with temporary.open("xb") as file:
                 writer = PartWriter(file)
@@ -85,6 +85,16 @@ class PartFiles:
     def remove(self, key: str) -> None:
         """Delete a part if it exists."""
         discard(self._path(key))
+
+    def temporary(self, name: str) -> Path:
+        """Return an unused name in the work folder, which is on the same disk as the results.
+
+        A file that a killed process leaves there is deleted with the work folder.
+
+        Args:
+            name: Name that the file will have when it is complete.
+        """
+        return self._folder / f".{name[:200]}.{secrets.token_hex(8)}{SUFFIX}"
 
     @contextmanager
     def _opened(self, key: str) -> Iterator[IO[bytes]]:
@@ -123,11 +133,6 @@ class PartWriter:
         at = self._file.tell()
         pickle.dump((False, self.summary), self._file, protocol=pickle.HIGHEST_PROTOCOL)
         self._file.write(_OFFSET.pack(at))
-
-
-def beside(path: Path) -> Path:
-    """Return an unused temporary name next to ``path``."""
-    return path.with_name(f".{path.name[:200]}.{secrets.token_hex(8)}{SUFFIX}")
 
 
 def put_in_place(temporary: Path, path: Path) -> None:

@@ -17,7 +17,7 @@ from skinnode.record.field_rows import row_of
 from skinnode.record.mcap_file import MCAP, McapFile
 from skinnode.record.parquet_file import ParquetFile
 from skinnode.record.replay import Replay
-from skinnode.resolve.part_files import PartFiles, beside, put_in_place
+from skinnode.resolve.part_files import PartFiles, put_in_place
 from skinnode.resolve.patch_solver import SolvedScan, SolveSummary
 from skinnode.resolve.recording import Recording
 
@@ -44,7 +44,7 @@ def new_result(
         ConfigError: The file cannot be written, or a package for its format is missing.
         SkinError: A part cannot be read.
     """
-    temporary = beside(target)
+    temporary = parts.temporary(target.name)
     try:
         write = _write_mcap if target.suffix == MCAP else _write_parquet
         write(recording, hand, solved, temporary, parts)

@@ -21,7 +21,10 @@ from skinnode.record.replay import Replay
 from skinnode.resolve.recording import Recording
 
 Place = tuple[int, int, int]
-"""Position of a field in a replay: :attr:`Replay.place`, and the number of the scan in its capture."""
+"""Position of a field in a replay: :attr:`Replay.place`, and the number of the scan at this place.
+
+All scans at a place are from one bus, so the position does not depend on the other buses of a capture.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +85,7 @@ class Capture:
 
     def __init__(self, recording: Recording, hand: HandConfig, buses: tuple[str, ...]) -> None:
         self._kept: list[CapturedFacts | CapturedScan] = []
-        self._scans = 0
+        self._place, self._scans = (-1, -1), 0
         self._run = Replay(recording.opened(hand), solver=self._solver, buses=buses)
 
     def __iter__(self) -> Iterator[CapturedFacts | CapturedScan]:
@@ -115,9 +118,10 @@ class Capture:
         return _CapturingSolver(facts, self._keep)
 
     def _keep(self, scan: Scan, stamp: ScanStamp, verdict: Verdict) -> None:
-        self._scans += 1
-        place = (*self._run.place, self._scans)
-        self._kept.append(CapturedScan(place, self._run.clock(), scan, stamp, verdict))
+        place = self._run.place
+        self._scans = self._scans + 1 if place == self._place else 0
+        self._place = place
+        self._kept.append(CapturedScan((*place, self._scans), self._run.clock(), scan, stamp, verdict))
 
 
 class _CapturingSolver(ScanSolver):

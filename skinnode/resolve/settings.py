@@ -6,6 +6,7 @@ import itertools
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from skinnode.config import HandConfig, PatchConfig, SolverConfig, parse_hand
@@ -63,6 +64,8 @@ def variants(options: Sequence[str]) -> list[Variant]:
 def apply(hand: HandConfig, variant: Variant) -> HandConfig:
     """Return a copy of the hand with the settings of a variant and without a time limit for solving.
 
+    File names become absolute, because a worker may have another working directory.
+
     Raises:
         ConfigError: A patch or a key does not exist, or a value is not allowed.
     """
@@ -73,7 +76,10 @@ def apply(hand: HandConfig, variant: Variant) -> HandConfig:
     solver = table.get("solver", {})
     for key in _LIVE:
         solver.pop(key, None)
-    return parse_hand(table, where="--set")
+    changed = parse_hand(table, folder=Path.cwd(), where="--set")
+    for setting in variant:
+        _require_effect(changed, setting)
+    return changed
 
 
 def name_of(variant: Variant) -> str:
@@ -112,6 +118,22 @@ def _paths(hand: HandConfig, setting: Setting) -> list[list[str | int]]:
     if name != _EVERY_PATCH and name not in names:
         raise ConfigError("--set", setting.key, f"a patch of the recording: {', '.join(names)}; or * for all")
     return [["patches", i, *keys] for i, each in enumerate(names) if name in (_EVERY_PATCH, each)]
+
+
+def _require_effect(hand: HandConfig, setting: Setting) -> None:
+    """Raise ConfigError if a setting describes the layout of a patch whose node supplies its own."""
+    if setting.key.startswith("solver."):
+        return
+    _, keys = _patch_and_key(setting.key)
+    if keys[0] != "layout" or keys[1:] in ([], ["coordinates"]):
+        return
+    for path in _paths(hand, setting):
+        patch = hand.patches[int(path[1])]
+        if patch.layout.coordinates == "node":
+            key = f"patches.{patch.name}.layout.coordinates"
+            raise ConfigError(
+                "--set", setting.key, f"only with {key}=preset, because the node supplied its layout"
+            )
 
 
 def _set(table: Any, path: list[str | int], setting: Setting) -> None:

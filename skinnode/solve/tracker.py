@@ -56,6 +56,8 @@ aligned layout.
 """
 GAP_NS: Final = 2_000_000_000
 """Interval between two frames, in ns, above which frames before the gap are not used."""
+GAP_PERIODS: Final = 1.5
+"""Minimum length of such a gap, in scan periods."""
 
 
 class Tracker:
@@ -92,6 +94,7 @@ class Tracker:
         self.method, self.reason = self._chosen = choose_method(layout, options)
         self.t_ns: int | None = None
         self._last_ns: int | None = None
+        self._gap_ns = max(GAP_NS, round(1e9 * GAP_PERIODS * options.scan_period_s))
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         self._contacts: ExactContacts | None = None
@@ -152,6 +155,7 @@ class Tracker:
         if self._skew is not None:
             self._skew.reset()
         if self._exact is None:
+            self._follow_noise()
             return
         self._exact.reset()
         self._gate.reset()
@@ -258,7 +262,7 @@ class Tracker:
         """Forget the frames before a gap in the stream."""
         now, last = self.t_ns, self._last_ns
         self._last_ns = now
-        if now is not None and last is not None and not 0 <= now - last <= GAP_NS:
+        if now is not None and last is not None and not 0 <= now - last <= self._gap_ns:
             self._posterior.forget_past()
             if self._skew is not None:
                 self._skew.reset()
@@ -360,11 +364,13 @@ class Tracker:
         changed, self.method, self.reason = method != self.method, method, reason
         if changed and method == "posterior":
             self._posterior.reset()
+            self._posterior.stop_at(math.inf)  # the deadline of the last root check has passed
             self._posterior.noise_estimate = noise
         elif changed:
             self._posterior.noise_estimate = None
             self._exact.reset()
             self._gate.reset()
+            self._check.reset()
             if self._contacts is not None:
                 self._contacts.reset()
 

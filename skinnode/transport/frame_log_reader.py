@@ -108,6 +108,8 @@ class FrameLogReader:
     def _asc(self) -> Iterator[LoggedFrame]:
         """Yield the frames of an ASC file. python-can parses the file and skips lines that are not frames."""
         head = self._file.read(_ASC_HEAD_BYTES)
+        if not head:  # a log without frames, as in the other formats
+            return
         if re.search(rb"^date\s", head, re.MULTILINE | re.IGNORECASE) is None:
             self._complain(1, 0, f"not an ASC file: {_shown(head[:16])}")
             return

@@ -21,7 +21,7 @@ from skinnode.monitor.view_model import History
 from skinnode.record import Replay, replay
 from skinnode.view.drawing_thread import RATE_HZ, STATE_S
 from skinnode.view.texts import DrawnCounts
-from skinnode.view.tick import Tick
+from skinnode.view.tick import SuppliedPositions, Tick
 
 _CHECK_NS: Final = 50_000_000
 """Interval between health checks in recording time, in ns; the same as in a running host."""
@@ -54,12 +54,14 @@ class Conversion:
         """The replay; its ``hand`` is the recorded hand."""
         self.faults = FaultBook(live=False)
         self._history = History(self.replay.hand, live=False)
+        self._positions = SuppliedPositions(self.replay.hand, self.replay.layout)
         events = Events()
         self._events = events.subscribe(_EVENTS)
         self._watch = HealthWatch(
             lambda: health_in(self.replay),
             lambda: bus_health_in(self.replay),
             events,
+            touches=self.replay.publisher.touches.take,
             now_ns=self.replay.clock,
         )
         self._draw: Draw | None = None
@@ -117,4 +119,5 @@ class Conversion:
             self.faults.update(view, now_ns, ending=ending)
         fields, self._pending = self._pending, {}
         self._drawn += len(fields)
-        self._draw(Tick(now_ns, fields, self.counts, view, drain(self._events)))
+        events = drain(self._events)
+        self._draw(Tick(now_ns, fields, self.counts, view, events, self._positions.changed()))

@@ -12,6 +12,7 @@ import rerun as rr
 from skinnode.config import HandConfig
 from skinnode.host import HandFrame
 from skinnode.host.hand_frame import LATE
+from skinnode.host.skeleton import Skeleton
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.model.pose import Pose
@@ -81,6 +82,7 @@ class HandDrawing:
         self._rest_m = {name: layout.upper_m for name, layout in layouts.items()}
         self._pitch_m = {name: layout.pitch_m for name, layout in layouts.items()}
         self.placement: Placement = placement_of(hand, layouts)
+        self._skeleton = Skeleton.of(hand)  # of the hand file, even if the patches are drawn side by side
         self._paths = {name: rr.new_entity_path(self.placement.path(name)) for name in layouts}
         self._scale = Scale()
         self._newest: dict[str, FieldFrame] = {}
@@ -112,14 +114,7 @@ class HandDrawing:
                 rr.Mesh3D.from_fields(triangle_indices=triangles(*rest_m.shape[:2])),
                 static=True,
             )
-            edge = rr.LineStrips3D([edge_m(rest_m)], colors=EDGE_RGB, radii=1.5 * _THIN * self._pitch_m[name])
-            log(f"{path}/edge", edge, static=True)
-            below = 0.5 * (rest_m[0, 0] + rest_m[0, -1]) - [0.0, self._pitch_m[name], 0.0]
-            log(
-                f"{path}/name",
-                rr.Points3D([below], labels=[name], radii=1e-5, colors=_CONTACT_RGB),
-                static=True,
-            )
+            self._log_outline(name)
             thin_m = _THIN * self._pitch_m[name]
             log(f"{path}/surface", rr.Arrows3D.from_fields(radii=2 * thin_m, colors=SHEAR_RGB), static=True)
             log(
@@ -140,16 +135,29 @@ class HandDrawing:
         ):
             log(path, rr.SeriesLines(names=lines, colors=shades, widths=widths), static=True)
 
+    def _log_outline(self, name: str) -> None:
+        """Write the edge and the name of a patch at its electrode positions at rest."""
+        rest_m, path = self._rest_m[name], self._paths[name]
+        edge = rr.LineStrips3D([edge_m(rest_m)], colors=EDGE_RGB, radii=1.5 * _THIN * self._pitch_m[name])
+        self._stream.log(f"{path}/edge", edge, static=True)
+        below = 0.5 * (rest_m[0, 0] + rest_m[0, -1]) - [0.0, self._pitch_m[name], 0.0]
+        label = rr.Points3D([below], labels=[name], radii=1e-5, colors=_CONTACT_RGB)
+        self._stream.log(f"{path}/name", label, static=True)
+
     def draw(self, tick: Tick) -> None:
         """Write the new data for one instant.
 
         Args:
             tick: New fields and, at some instants, the hand's state.
         """
+        self._rest_m.update(tick.supplied_m)
         if not self._begun:
             self._begin(
                 min((_time_ns(field, tick.t_ns) for field in tick.fields.values()), default=tick.t_ns)
             )
+        else:
+            for name in tick.supplied_m:
+                self._log_outline(name)
         deepest_m = max((_deepest_m(field) for field in tick.fields.values()), default=0.0)
         self._scale.update(tick.t_ns, deepest_m)
         for name, field in tick.fields.items():
@@ -235,7 +243,7 @@ class HandDrawing:
         fields = {name: each for name, each in self._newest.items() if name not in self._stale}
         scan = max((each.stamp.scan for each in fields.values() if each.stamp is not None), default=0)
         missing = {name: conditions.get(name, LATE) for name in self._rest_m if name not in fields}
-        return HandFrame(scan, t_ns, fields, missing, self.placement.skeleton)
+        return HandFrame(scan, t_ns, fields, missing, self._skeleton)
 
     def _notes(self) -> list[str]:
         shear = SHEAR * self._exaggeration

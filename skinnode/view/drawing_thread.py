@@ -18,7 +18,7 @@ from skinnode.monitor.view_model import History
 from skinnode.process import clock
 from skinnode.process.closing import Closing
 from skinnode.view.texts import DrawnCounts
-from skinnode.view.tick import Tick
+from skinnode.view.tick import SuppliedPositions, Tick
 
 RATE_HZ: Final = 30.0
 """Default limit on fields drawn per patch per second; screens show at most 60 frames per second."""
@@ -43,6 +43,7 @@ class DrawingThread(Closing):
         self.failure: SkinError | None = None
         """Error from the source or the drawing; None if no error has occurred."""
         self._history = History(source.hand, live=source.live)
+        self._positions = SuppliedPositions(source.hand, source.layout)
         self._fields = source.fields(_QUEUED * len(source.hand.patches))
         self._drawn = self._left_out = 0
         self._state_due_s = clock.monotonic()
@@ -96,4 +97,4 @@ class DrawingThread(Closing):
             view = self._history.add(snapshot)
             self.faults.update(view, clock.monotonic_ns(), ending=ending or self._source.over)
         t_ns = self._source.now_ns() if snapshot is None else snapshot.t_ns
-        self._draw(Tick(t_ns, newest, self.counts, view, events))
+        self._draw(Tick(t_ns, newest, self.counts, view, events, self._positions.changed()))

@@ -14,6 +14,7 @@ from skinnode.view.viewer_process import (
     MEMORY,
     ViewerProcess,
     free_port,
+    in_url,
     require_display,
     require_free,
 )
@@ -114,7 +115,6 @@ def _serve(stack: ExitStack, options: OutputOptions) -> tuple[ViewerProcess, str
     asked = ["--serve-web", "--web-viewer-port", str(files_port), "--server-memory-limit", MEMORY]
     if address != LOCAL:
         asked += ["--cors-allow-origin", f"http://*:{port}"]
-    viewer = stack.enter_context(ViewerProcess(address, port + 1, asked))
+    viewer = stack.enter_context(ViewerProcess(address, port + 1, asked, files_port=files_port))
     stack.enter_context(WebPage(address, port, port + 1, files_port))
-    shown = f"[{address}]" if ":" in address else address
-    return viewer, f"http://{shown}:{port}/"
+    return viewer, f"http://{in_url(address)}:{port}/"

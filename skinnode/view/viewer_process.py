@@ -42,13 +42,14 @@ class ViewerProcess(Closing):
         address: Address on which the process listens.
         port: Port on which the process receives data.
         options: Further options for the ``rerun`` program.
+        files_port: Port on which these options make the program serve its files; None if there is none.
 
     Raises:
         ConfigError: The port is in use or the address does not belong to this machine.
         SkinError: The program ended before it started to listen.
     """
 
-    def __init__(self, address: str, port: int, options: list[str]) -> None:
+    def __init__(self, address: str, port: int, options: list[str], *, files_port: int | None = None) -> None:
         require_free(address, port)
         self._folder = tempfile.TemporaryDirectory(prefix="skinnode-view-")
         self._errors = Path(self._folder.name, "stderr.txt")
@@ -62,10 +63,12 @@ class ViewerProcess(Closing):
                 env=_environment(Path(self._folder.name)),
                 preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
-        self.url = f"rerun+http://{_reachable(address)}:{port}/proxy"
+        self.url = f"rerun+http://{in_url(reachable(address))}:{port}/proxy"
         """URL to which the SDK sends data."""
         try:
-            self._wait_until_it_listens(address, port)
+            for each in (port, files_port):
+                if each is not None:
+                    self._wait_until_it_listens(address, each)
         except BaseException:
             self.close()
             raise
@@ -103,7 +106,7 @@ class ViewerProcess(Closing):
             if self.ended:
                 raise SkinError(f"the viewer ended: {self.why()}")
             try:
-                socket.create_connection((_reachable(address), port), timeout=1.0).close()
+                socket.create_connection((reachable(address), port), timeout=1.0).close()
             except OSError:
                 time.sleep(0.05)
             else:
@@ -148,10 +151,13 @@ def free_port() -> int:
         return port
 
 
-def _reachable(address: str) -> str:
+def reachable(address: str) -> str:
     """Return the address at which this machine reaches a server that listens on ``address``."""
-    if address in ("0.0.0.0", "::"):
-        return LOCAL
+    return LOCAL if address in ("0.0.0.0", "::") else address
+
+
+def in_url(address: str) -> str:
+    """Return an address as it is written in a URL: an IPv6 address has brackets."""
     return f"[{address}]" if ":" in address else address
 
 

@@ -18,7 +18,7 @@ from typing import Final
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from skinnode.process.closing import Closing
-from skinnode.view.viewer_process import LOCAL, require_free
+from skinnode.view.viewer_process import in_url, reachable, require_free
 
 _FILES: Final = ("/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/apple-touch-icon.png")
 _ELSEWHERE: Final = re.compile(
@@ -42,7 +42,7 @@ class WebPage(Closing):
         address: Address on which to listen.
         port: Port on which to listen.
         data_port: Port from which the browser fetches the data.
-        files_port: Local port on which the SDK serves its viewer files.
+        files_port: Port on the same address, on which the SDK serves its viewer files.
 
     Raises:
         ConfigError: The port is in use or the address does not belong to this machine.
@@ -53,7 +53,8 @@ class WebPage(Closing):
 
         class Handler(_Handler):
             ports = (data_port, files_port)
-            otherwise = address
+            files_address = reachable(address)
+            otherwise = in_url(address)
 
         kind = type("Server", (ThreadingHTTPServer,), {"address_family": _family(address)})
         self._server: ThreadingHTTPServer = kind((address, port), Handler)
@@ -92,6 +93,7 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers GET requests for the page and the viewer files; returns 404 for every other path."""
 
     ports: tuple[int, int]
+    files_address: str
     otherwise: str
     """Host name used if the browser's request has no valid ``Host`` header."""
     protocol_version = "HTTP/1.1"
@@ -123,15 +125,18 @@ class _Handler(BaseHTTPRequestHandler):
     def _data_url(self) -> str:
         return f"rerun+http://{self._host()}:{self.ports[0]}/proxy"
 
+    def _files(self) -> http.client.HTTPConnection:
+        return http.client.HTTPConnection(self.files_address, self.ports[1], timeout=self.timeout)
+
     def _fetch(self, path: str) -> bytes:
-        connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
+        connection = self._files()
         connection.request("GET", path)
         with connection.getresponse() as answer:
             return answer.read()
 
     def _pass_on(self, path: str) -> None:
         """Pass on an SDK file in chunks, because the largest file is 43 MB."""
-        connection = http.client.HTTPConnection(LOCAL, self.ports[1], timeout=self.timeout)
+        connection = self._files()
         connection.request("GET", path)
         with connection.getresponse() as answer:
             self.send_response(answer.status)

@@ -52,6 +52,7 @@ def figures(folder: Path) -> dict:
     return json.loads((folder / "pareto.json").read_text())
 
 
+@pytest.mark.long
 def test_in_noise_discs_and_earlier_frames_reduce_the_error_of_a_held_body(figures):
     held = {row["method"]: row for row in bench.pooled(figures, 1e-3, "held")}
     assert held["exact"]["error"] > 2.0 * held["cells"]["error"]

@@ -28,6 +28,7 @@ def rows(setting: dict, key: str) -> list[dict]:
     return [row for operator in setting[key].values() for row in operator]
 
 
+@pytest.mark.long
 def test_every_cell_of_table_3_is_bettered(outcome):
     output, figures, _ = outcome
     assert [setting["layout"] for setting in figures["settings"]] == ["staggered", "aligned", "aligned"]

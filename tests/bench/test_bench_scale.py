@@ -24,6 +24,7 @@ def test_each_scan_of_each_patch_is_solved() -> None:
     assert all(row[part] > 0.0 for part in ("nodes_ms", "bus_ms", "host_ms", "faster", "memory_mb"))
 
 
+@pytest.mark.long
 def test_a_further_patch_takes_little_memory() -> None:
     """Skin, node, host and solver of one patch: 1.5 MB when the limit was set, so 1,000 patches fit."""
 
@@ -52,6 +53,7 @@ def test_large_hands_are_measured_for_fewer_scans() -> None:
     assert scale.scans_of(1000, 1) == 1
 
 
+@pytest.mark.long
 def test_the_command_prints_writes_and_plots(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,6 +77,7 @@ def test_the_command_prints_writes_and_plots(
     draw(image, figures)
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_in_real_time_all_scans_are_sent_and_solved_in_two_processes() -> None:
     row = real_time.measure(patches=5, touched=1, hop_limit=0, seconds=1.0)  # on two buses

@@ -67,6 +67,22 @@ def test_load_of_can_fd_is_the_worst_case_too() -> None:
         check_plan(parse_hand(table))
 
 
+@pytest.mark.parametrize(("columns", "worst_s"), [(2, 135e-6), (3, 32e-6 + (129 + 23) / 5e6)])
+def test_chunks_of_up_to_8_bytes_are_classic_frames_on_can_fd_too(columns: int, worst_s: float) -> None:
+    table = minimal(fd=True)
+    table["patches"][0]["layout"] = {"lower_wires": columns}
+    chunks = next(frame for frame in only_plan(table).frames if frame.name == "chunks of thumb")
+    assert chunks.worst_s == pytest.approx(worst_s, rel=1e-12)
+
+
+def test_inhibit_time_of_few_frames_in_a_long_period_fits_its_object() -> None:
+    assert inhibit_time_100us(60_000, 8) == 60_000
+    assert inhibit_time_100us(60_000, 6) == 0xFFFF  # of 80,000
+    table = minimal(fd=True) | {"sync": {"period_ms": 60_000}}
+    table["patches"][0]["layout"] = {"upper_wires": 5}
+    assert only_plan(table).scans[0].paced_s == pytest.approx(4 * 6.5535)
+
+
 def test_longest_can_fd_frames_of_a_byte() -> None:
     # All data of 1 byte, in front of any CRC: the data phase and the stuffing of the head behind BRS.
     fast = fd_bits([0x181] * 256, [[value] for value in range(256)])[1]

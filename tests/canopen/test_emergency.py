@@ -29,6 +29,8 @@ def test_every_code_of_the_node_has_words_of_its_own() -> None:
         (0x8110, "00 00 01 00 00", "overrun: messages or scans lost"),  # emergencies, not scans
         (0x8150, "0b 07", "CAN-ID collision: another node has this node-ID: 0x70B"),
         (0x8250, "02 00", "RPDO timed out: RPDO2"),
+        (0x8210, "02 01 06 00 00", "PDO not processed: too short: RPDO2, 1 byte instead of 6"),
+        (0x8210, "2c 01 06 01 00", "PDO not processed: too short: RPDO300, 1 byte instead of 6"),
         (0x3210, "", "voltage inside"),
         (0x2F00, "", "error of class 0x2000"),
     ],

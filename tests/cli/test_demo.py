@@ -25,6 +25,7 @@ from vcan_sim.fleet import Fleet
 SKINNODE = Path(sys.executable).with_name("skinnode")
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_the_demo_runs_and_writes_what_it_promises(tmp_path: Path) -> None:
     figures, plot = tmp_path / "demo.json", tmp_path / "demo.png"

@@ -329,6 +329,8 @@ def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -
         ),
         (["--store", "/no/such/folder/x"], "error: --store: got '/no/such/folder/x', allowed: a file in an"),
         (["--node-id", "4", "--layout", "wavy"], "error: --layout: got 'wavy', allowed: aligned"),
+        (["--node-id", "4", "--channel", ""], "error: --channel: got '', allowed: a name of printable"),
+        (["--node-id", "4", "--interface", ""], "error: --interface: got '', allowed: a name of printable"),
         (["--node-id", "4", "--code-bits", "12"], "error: code_bits: got 12, allowed: 16 or 24"),
     ],
 )
@@ -337,6 +339,13 @@ def test_options_that_cannot_be(sources: Path, options: list[str], says: str) ->
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(says)
+
+
+def test_a_channel_may_have_a_long_name() -> None:
+    """Such as /dev/serial/by-id/usb-Protofusion_Labs_CANable_…-if00 of an adapter with a serial line."""
+    options = ["--interface", "virtual", "--channel", "/dev/serial/by-id/" + 100 * "x", "--seconds", "0.1"]
+    done = run_here("node", "--source", "simulated", "--node-id", "4", *options)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 BAD = [

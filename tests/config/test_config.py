@@ -510,6 +510,17 @@ def test_one_channel_for_several_buses() -> None:
         hand.on(channel="vcan0")
 
 
+def test_another_interface_does_not_make_one_bus_of_two() -> None:
+    """The frames of both would arrive at each, and nodes with the same node-ID would be mixed."""
+    buses = [{"name": name, "interface": name, "channel": "0"} for name in ("pcan", "kvaser")]
+    patches = [{"name": f"of {bus['name']}", "node_id": 5, "bus": bus["name"]} for bus in buses]
+    hand = parse_hand({"buses": buses, "patches": patches})
+    with pytest.raises(ConfigError) as caught:
+        hand.on("virtual")
+    line = "--interface: got 'virtual', allowed: only for a hand whose buses have different channels"
+    assert str(caught.value) == line
+
+
 def test_options_do_not_change() -> None:
     hand = parse_hand(minimal())
     with pytest.raises(ValueError, match="frozen"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skinnode.conformance import run_cases, select
+from skinnode.conformance import Verdict, run_cases, select
 from skinnode.transport import Frame
 
 from .faulty import ANSWER, BAD, CHUNK, ERROR_CONTROL, OK, SYNC, Hear, expected, faulty, found
@@ -49,6 +49,23 @@ def starts_by_itself(frame: Frame) -> list[tuple[int, bytes]]:
 def test_what_is_heard(hear: Hear, fail: str, pass_: str) -> None:
     with faulty(hear=hear) as dut:
         assert found(dut, *fail.split(), *pass_.split()) == expected(fail, pass_)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("SYNC-03", 10), ("PDO-22", 1)])
+def test_a_transmission_type_that_a_node_does_not_have_is_no_failure(name: str, kind: int) -> None:
+    request = b""
+
+    def hear(frame: Frame) -> list[tuple[int, bytes]]:
+        nonlocal request
+        request = frame.data if frame.can_id == ANSWER + 0x80 else request
+        return []
+
+    def alter(can_id: int, data: bytes) -> bytes:
+        asked = can_id == ANSWER and request[0] == 0x2F and request[2:5] == bytes((0x18, 2, kind))
+        return b"\x80" + request[1:4] + b"\x30\0\x09\x06" if asked else data
+
+    with faulty(alter, hear) as dut:
+        assert found(dut, name) == {name: Verdict.NOT_APPLICABLE}
 
 
 # --- nodes that do not answer as a node should at all

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from skinnode.canopen.lss import LssAddress
-from skinnode.config import PatchConfig, SimulationConfig
+from skinnode.config import BusConfig, PatchConfig, SimulationConfig
 from skinnode.diagnose.bus_listener import Emergency
 from skinnode.diagnose.checks.run import not_judged, others, run_checks
+from skinnode.diagnose.collect_facts import collect_facts
 from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.model.layout import PatchLayout
 from skinnode.text.printable import printable
@@ -44,6 +45,7 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
         ({"link_bitrate_bps": 500_000}, "the bit rate of the interface differs", Sure.CERTAIN),
         ({"error_frames": 3}, "error frames", Sure.CERTAIN),
         ({"load": 0.85}, "exceeds the planning limit", Sure.CERTAIN),
+        ({"load": 0.5, "max_load": 0.45}, "exceeds the planning limit", Sure.CERTAIN),
         ({"outages": 1}, "the interface failed", Sure.CERTAIN),
         ({"foreign": {0x3F0: 100}}, "of unknown origin", Sure.POSSIBLE),
         ({"unconfigured": (LssAddress(0, 1, 2, 7),)}, "without a node-ID", Sure.CERTAIN),
@@ -75,6 +77,13 @@ def test_bus(changes: dict[str, Any], what: str, sure: Sure) -> None:
     finding = one(bus_of(WELL, **changes))
     assert what in finding.what
     assert finding.sure is sure
+
+
+def test_the_planning_limit_is_that_of_the_hand_file() -> None:
+    bus = BusConfig(name="can0", interface="socketcan", channel="nocan0", max_load=0.9)
+    facts = collect_facts(bus, None)  # there is no such interface
+    assert facts.failure
+    assert run_checks(bus_of(WELL, load=0.85, max_load=facts.max_load)) == []
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,27 @@ def test_finds_every_node_with_its_identity(
     assert found.seconds < 3.0
 
 
+def test_a_heartbeat_every_four_seconds_is_waited_for(
+    bus: BusConfig, powered: Powered, connection_on: ConnectionOn
+) -> None:
+    powered(bus, 5)
+    connection_on(bus).od(5).write(od.HEARTBEAT_PRODUCER, 0, "u16", 4000)
+    (found,) = discover(connection_on(bus)).nodes
+    assert (found.state, found.state_known_by) == ("pre-operational", "heartbeat")
+
+
+def test_a_slow_bus_can_carry_the_requests(bus: BusConfig, connection_on: ConnectionOn) -> None:
+    """At 50 kbit/s, a frame of 8 bytes takes at least 2.16 ms."""
+    connection = connection_on(bus.model_copy(update={"bitrate_bps": 50_000}))
+    times_ns: list[int] = []
+    connection.link.listen_to_sent(
+        lambda frame: times_ns.append(frame.t_ns) if 0x601 <= frame.can_id <= 0x67F else None
+    )
+    discover(connection)
+    assert len(times_ns) == 2 * 127
+    assert times_ns[126] - times_ns[0] > 126 * 2 * 2_160_000  # each request, and a response to each
+
+
 def test_nodes_without_a_node_id_are_told_apart_and_wait_again(
     bus: BusConfig, powered: Powered, connection_on: ConnectionOn
 ) -> None:

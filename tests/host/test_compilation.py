@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import gc, json, os, sys
 import numpy as np
@@ -46,6 +48,7 @@ FAULTS = "none", "crossing stuck at a constant", "lower wire open", "upper wires
 CASES = [[noise, fault] for noise in (1e-5, 1e-3) for fault in FAULTS]
 
 
+@pytest.mark.long
 def test_nothing_is_compiled_once_a_patch_has_been_set_up() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(CASES)],

@@ -27,6 +27,7 @@ from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, eventually, heard
+from .test_roles import changed
 
 LAYOUT = PatchLayout.preset("staggered", **SMALL)
 
@@ -118,6 +119,15 @@ def test_configuration_is_in_the_node(hand: HandConfig, fleet: Fleet) -> None:
         assert (od.read(0x1800, 1, "u32"), od.read(0x1800, 2, "u8")) == (0x185, 254)
         assert od.read(0x1800, 3, "u16") == 11  # 0.8 · 25 ms over 16 chunks and a summary, in 100 µs
         assert (od.read(0x1801, 1, "u32"), od.read(0x1801, 2, "u8")) == (0x285, 1)
+
+
+def test_the_inhibit_time_fits_its_object_however_far_apart_the_scans_are(
+    make_hand: Callable[..., HandConfig],
+) -> None:
+    layout = {"upper_wires": 2, "upper_electrodes": 2, "lower_wires": 6, "lower_electrodes": 2}
+    hand = changed(make_hand(patches=1), patch={"layout": layout}, sync={"period_ms": 60_000})
+    with Fleet(hand), Host.from_config(hand) as host:  # 0.8 of a minute over 4 chunks and a summary
+        assert host.health("p0").nmt_state == NmtState.OPERATIONAL
 
 
 def test_what_an_integrator_has_set_does_not_stand_in_the_way(

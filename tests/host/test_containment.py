@@ -30,6 +30,7 @@ from skinnode.transport import CanPort, Frame
 from skinnode.transport.receiver import Intake, Receiver
 
 from .conftest import SMALL, Rack, eventually
+from .test_roles import changed
 
 
 class Broken:
@@ -269,6 +270,22 @@ def test_a_defect_in_serving_a_bus_or_the_host_is_over_when_it_is_over(
         assert eventually(
             lambda: any((event.subject, event.what) == (subject, "defects") for event in taken(events))
         )
+
+
+def test_defects_of_a_bus_are_told_although_a_patch_has_its_name(
+    make_hand: Callable[..., HandConfig],
+    rack_of: Callable[[HandConfig], Rack],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hand = changed(make_hand(patches=1), patch={"name": "can0"})
+    rack_of(hand).plug("can0")
+    broken = Broken(monkeypatch, BusLoad, "add_all", lambda this: True)
+    with Host.from_config(hand) as host:
+        broken.on = True
+        assert eventually(lambda: broken.raised >= 3)
+        broken.on = False
+        assert host.stats().defects["can0"].count >= 3
+        assert any("defects in the host" in fault for fault in faults_and_notes(host)[0])
 
 
 def taken(events: Any) -> Iterator[Any]:

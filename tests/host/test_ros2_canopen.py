@@ -94,6 +94,7 @@ def values(port: CanPort, node_id: int) -> dict[tuple[int, int], bytes]:
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["hand", "hand-guest", "hand-two-buses"])
 def test_dcfgen_reads_it_and_keys_are_those_of_the_documentation(name: str, tmp_path: Path) -> None:
     hand = load_hand(REPOSITORY / "examples" / f"{name}.toml")

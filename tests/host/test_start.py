@@ -9,14 +9,15 @@ from typing import Any
 import pytest
 
 from skinnode.config import BringUpConfig, HandConfig, Missing
-from skinnode.errors import NodeError, NodeTimeout
+from skinnode.errors import ConfigError, NodeError, NodeTimeout
 from skinnode.host import Host, lifecycle, start
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.solve.detect import touch_test
 from vcan_sim.fleet import Fleet
 
-from .conftest import Rack, eventually
+from .conftest import SMALL, Rack, eventually
+from .test_roles import changed
 
 
 class Node:
@@ -99,3 +100,22 @@ def test_nothing_is_computed_between_the_configuration_of_the_nodes_and_their_st
     with Fleet(hand), Host.from_config(hand) as host:
         assert host.fields(timeout_s=5).get() is not None
     assert before == [touch_test._thresholds.cache_info().misses]
+
+
+def test_a_patch_is_solvable_if_its_solver_options_make_it_so(make_hand: Callable[..., HandConfig]) -> None:
+    """Eight lower wires are too few for the 12 unknowns of a wire, but enough for its four heights."""
+    layout, solver = {**SMALL, "lower_wires": 8}, {"method": "exact", "normal_only": True}
+    hand = changed(make_hand(patches=1), patch={"layout": layout}, solver=solver)
+    with Fleet(hand), Host.from_config(hand) as host:
+        assert host.fields(timeout_s=10).get(10) is not None
+
+
+def test_solver_options_that_conflict_are_refused_before_the_nodes_are_asked(
+    make_hand: Callable[..., HandConfig],
+) -> None:
+    hand = make_hand(solver={"method": "exact", "drift": "patch"})  # without nodes
+    with pytest.raises(ConfigError) as caught, Host.from_config(hand):
+        pass
+    assert str(caught.value) == (
+        "patch 'p0': got 'staggered', allowed: method: got 'exact' with drift, must be posterior or auto"
+    )

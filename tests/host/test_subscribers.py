@@ -99,6 +99,18 @@ def test_async_silence_is_a_timeout_and_a_failure_is_raised(publisher: Publisher
         asyncio.run(collected(fields))
 
 
+def test_async_for_that_does_not_wait_has_what_was_queued(publisher: Publisher) -> None:
+    fields = publisher.subscribe(10, 0.0, None)
+    for number in (1, 2):
+        publisher.publish(field(number), "left")
+
+    async def main() -> list[FieldFrame]:
+        waiting = aiter(fields)
+        return [await anext(waiting) for _ in range(2)]
+
+    assert numbers(asyncio.run(main())) == [1, 2]
+
+
 def test_an_event_loop_that_was_left_costs_the_publisher_nothing(publisher: Publisher) -> None:
     fields = publisher.subscribe(10, None, None)
 

@@ -103,6 +103,34 @@ def test_a_node_that_somebody_resets_or_stops_runs_again(
         assert host.stats().other_masters["can0"].nmt_commands == 1
 
 
+def reset_by(host: Host, patch: str) -> bool:
+    """Whether a node that the host resets runs again."""
+    rejoins = host.stats().nodes[patch].rejoins
+    host.reset_node(patch)
+    return eventually(lambda: host.stats().nodes[patch].rejoins == rejoins + 1)
+
+
+def test_resets_that_the_host_commands_are_no_restart_loop(
+    hand: HandConfig, rack: Rack, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Host.from_config(hand) as host:
+        boot_ups = host.health("p0").boot_ups
+        assert all(reset_by(host, "p0") for _ in range(4))
+        assert host.health("p0").boot_ups == boot_ups + 4
+        assert not host.health("p0").restarts_in_a_loop
+    assert "restarted without a command" not in caplog.text
+
+
+def test_heartbeats_of_an_earlier_period_are_no_second_node(
+    hand: HandConfig, rack: Rack, listener: CanPort
+) -> None:
+    with Host.from_config(hand) as host:
+        listener.send(0x605, bytes.fromhex("2b 17 10 00 14 00 00 00"))  # a heartbeat every 20 ms
+        assert eventually(lambda: host.health("p0").duplicate_id)  # as often as of many nodes
+        assert reset_by(host, "p0")  # every 250 ms again
+        assert not host.health("p0").duplicate_id
+
+
 def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, rack: Rack) -> None:
     """After a reset it sends no heartbeat either."""
     with Host.from_config(hand) as host:
@@ -113,6 +141,24 @@ def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, 
         assert eventually(lambda: host.stats().nodes["p1"].rejoins == 1)
         take(host.fields(timeout_s=10, patch="p1"), 4)
         assert host.health("p1").boot_ups == boot_ups
+
+
+def test_searches_for_absent_nodes_do_not_delay_a_node_that_is_back(
+    make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
+) -> None:
+    """An LSS search takes a fifth of a second, and a bus carries one at a time."""
+    hand = make_hand(patches=24, sync={"period_ms": 250}, bring_up={"missing": "wait"})
+    table = hand.model_dump(mode="json")
+    for number, patch in enumerate(table["patches"][1:], 1):
+        patch["serial"] = 1000 + number
+    hand = parse_hand(table)
+    rack_of(hand).plug("p0")
+    with Host.from_config(hand, boot_deadline_s=0.2) as host:
+        take(host.fields(timeout_s=10, patch="p0"), 8)
+        for _ in range(3):
+            begun_s = clock.monotonic()
+            assert reset_by(host, "p0")
+            assert clock.monotonic() - begun_s < BACK_S
 
 
 def test_a_node_that_restarts_in_a_loop_is_taken_up_when_it_has_calmed_down(

@@ -7,7 +7,7 @@ import queue
 import pytest
 
 from skinnode.errors import BusError
-from skinnode.host.sync import SyncProducer, Ticks
+from skinnode.host.sync import SyncFollower, SyncProducer, Ticks
 from skinnode.process import clock
 from vcan_sim.virtual_time import VirtualClock
 
@@ -29,6 +29,21 @@ def test_ticks_name_the_newest_sync_of_a_counter() -> None:
     assert ticks.find(240) == (240, 240_000)
     assert ticks.find(0) is None
     assert ticks.find(241) is None
+
+
+@pytest.mark.parametrize(
+    ("overflow", "lost"), [(240, (290,)), (240, (299, 300)), (8, (20,)), (2, ()), (3, ())]
+)
+def test_a_scan_whose_sync_was_lost_has_its_own_number(overflow: int, lost: tuple[int, ...]) -> None:
+    """Not that of the SYNC one round of the counter before, whose counter it has."""
+    ticks = Ticks(overflow)
+    follower = SyncFollower(ticks)
+    for number in range(1, 3 * overflow):
+        if number not in lost:
+            follower.on_sync(bytes([ticks.counter_of(number)]), 1000 * number)
+        for scan in {number, number - 1, number - overflow // 2}:  # scans may arrive after later SYNCs
+            if scan > 0:
+                assert ticks.find(ticks.counter_of(scan)) == (scan, 0 if scan in lost else 1000 * scan)
 
 
 def test_the_tick_is_known_before_the_frame_is_out() -> None:

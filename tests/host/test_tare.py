@@ -36,6 +36,41 @@ def test_a_pressed_patch_reads_zero_after_a_tare(hand: HandConfig, rack: Rack) -
         assert host.stats().nodes["p1"].baselines == 0
 
 
+class Mute:
+    """Lets neither the chunks nor the summary of a scan through, from one scan on to another."""
+
+    def __init__(self) -> None:
+        self.wanted = self.active = False
+
+    def __call__(self, can_id: int, data: bytes) -> bool:
+        if can_id == 0x185 and data[0] == 0:
+            self.active = self.wanted
+        return not (self.active and can_id in (0x185, 0x285))
+
+
+def test_a_tare_by_others_is_followed_though_the_scan_that_announces_it_is_lost(
+    hand: HandConfig, rack: Rack, listener: CanPort
+) -> None:
+    mute = Mute()
+    rack.pull("p0")
+    node = rack.plug("p0", lets_through=mute)
+    with Host.from_config(hand) as host:
+        rest_ohm = rack.sources["p0"].ohm
+        rack.sources["p0"].ohm = 0.98 * rest_ohm
+        assert eventually(lambda: depth_m(host, "p0") > 1e-5)
+        mute.wanted = True
+        assert eventually(lambda: mute.active)
+        scans = node.scans_sent
+        listener.send(0x605, b"\x23\x21\x20\x04" + b"tare")
+        assert eventually(lambda: (node.baseline_ohm < 0.99 * rest_ohm).all())
+        assert eventually(lambda: node.scans_sent > scans + 3)
+        mute.wanted = False
+        assert eventually(lambda: host.stats().nodes["p0"].baselines == 1)
+        assert eventually(lambda: depth_m(host, "p0") < 1e-6)
+        assert host.stats().patches["p0"].assembler.summaries_lost == 0
+        assert host.stats().nodes["p0"].rejoins == 0
+
+
 def test_a_guest_does_not_tare(make_hand: Callable[..., HandConfig], rack_of: Callable[..., Rack]) -> None:
     bus = {"interface": "timed", "channel": uuid.uuid4().hex[:8], "role": "guest", "guest_sends": "sdo"}
     hand = make_hand(1, sync={"period_ms": 25, "counter_overflow": 0}, buses=[bus])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 import re
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from skinnode.config import parse_hand
-from skinnode.host.health import Condition, PatchHealth
+from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.skeleton import Skeleton
 from skinnode.messages.can_frames import FrameEncoder, frame_message, frame_of
 from skinnode.messages.definitions import DEFINITIONS, FIELD, OURS, version_of
@@ -18,6 +19,7 @@ from skinnode.messages.poses import transforms
 from skinnode.messages.topics import HandTopics, patch_frame
 from skinnode.messages.typestore import decode, encode, schema_text
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
+from skinnode.transport.bus_state import BusState
 from skinnode.transport.frame import Frame
 
 T_NS = 1_790_000_000_123_456_789
@@ -99,6 +101,7 @@ def test_health_becomes_a_level_a_message_and_every_known_value() -> None:
     fault = DataFault(FaultyPart.UPPER, FaultKind.OPEN, upper=3)
     assert level_of(health(Condition.OPERATIONAL)) == OK
     assert level_of(health(Condition.OPERATIONAL, faults=(fault,))) == WARN
+    assert level_of(health(Condition.OPERATIONAL, duplicate_id=True)) == ERROR
     assert level_of(health(Condition.LOST)) == STALE
     assert level_of(health(Condition.REFUSED)) == ERROR
     patches = {"palm": health(Condition.LOST, faults=(fault,))}
@@ -110,6 +113,28 @@ def test_health_becomes_a_level_a_message_and_every_known_value() -> None:
     assert values["faults"] == "upper wire 3: open since scan 0"
     assert values["boot_ups"] == "1"
     assert "scan_age_s" not in values  # unknown
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "message"),
+    [
+        ({}, OK, "available"),
+        ({"controller": BusState.ACTIVE}, OK, "available"),
+        ({"controller": BusState.WARNING}, WARN, "the controller is error warning"),
+        ({"controller": BusState.PASSIVE}, WARN, "the controller is error passive"),
+        ({"controller": BusState.OFF}, ERROR, "the controller is bus-off"),
+        ({"controller": BusState.OFF, "away": "no such device"}, ERROR, "no such device"),
+        ({"no_sync": True}, ERROR, "no SYNC"),
+    ],
+)
+def test_a_bus_whose_controller_is_not_well_is_not_ok(changes, level, message) -> None:
+    counters = [entry.name for entry in dataclasses.fields(BusHealth) if entry.default is dataclasses.MISSING]
+    sound = BusHealth(**{**dict.fromkeys(counters, 0), "bus": "can0", "away": None, "foreign_ids": ()})
+    buses = {"can0": dataclasses.replace(sound, **changes)}
+    name = "diagnostic_msgs/msg/DiagnosticArray"
+    (status,) = decode(encode(diagnostics("left", {}, buses, T_NS), name), name).status
+    assert (status.name, status.hardware_id) == ("left: can0", "can0")
+    assert (status.level, status.message) == (level, message)
 
 
 @pytest.mark.parametrize(

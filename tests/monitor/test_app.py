@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import resource
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,28 @@ def test_a_recording_that_cannot_be_is_told_and_the_screen_goes_on(tmp_path: Pat
 
         (tmp_path / "taken").touch()
         in_app(source, play, folder=tmp_path / "taken", size=(120, 40))
+
+
+def test_a_recording_that_the_disk_has_ended_is_a_fault_also_when_the_screen_is_left(tmp_path: Path) -> None:
+    hand = a_hand(1)
+    kept = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:
+
+        async def play(pilot: Pilot[Any]) -> None:
+            await press(pilot, "r")
+            assert await eventually(pilot, lambda: source.recording is not None)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, kept[1]))
+            try:
+                assert await eventually(pilot, lambda: source.recording and source.recording.dropped)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, kept)
+            assert source.flaws == []  # of a recording under way, the screen tells
+
+        in_app(source, play, folder=tmp_path)
+        assert source.recording is None
+        failed, lost = source.flaws
+    assert failed.endswith("recording ended, because writing to the disk failed (File too large)")
+    assert re.search(r"\.log: \d+ frames not recorded$", lost)
 
 
 def test_pause_holds_the_picture_while_the_host_goes_on() -> None:

@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from skinnode.config import HandConfig
 from skinnode.node import NmtState
 from vcan_sim.faults import Faults
@@ -143,6 +145,7 @@ def test_a_terminal_that_vanishes_leaves_the_nodes_pre_operational(
         assert states(fleet) == {NmtState.PRE_OPERATIONAL}
 
 
+@pytest.mark.long
 def test_a_terminal_that_stalls_holds_up_neither_the_host_nor_the_end(
     tmp_path: Path, crossing_hand: HandConfig
 ) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinnode.host import Host
+from skinnode.host import Host, PatchHealth
+from skinnode.host.health import Condition
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import PatchLayout
@@ -24,7 +25,7 @@ from skinnode.monitor.replay_source import ReplaySource
 from skinnode.monitor.screen import screen
 from skinnode.monitor.session_faults import FaultBook, as_json
 from skinnode.monitor.theme import Paint, UiState, theme_for
-from skinnode.monitor.view_model import History, PatchView, View
+from skinnode.monitor.view_model import History, PatchView, View, judge_patch
 from skinnode.record import Recorder, replay
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
@@ -253,6 +254,29 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
         :1
     ]
     assert told.style != theme.good
+
+
+def test_a_patch_that_cannot_be_brought_up_says_why() -> None:
+    sound = PatchHealth(
+        patch="p0",
+        node_id=5,
+        condition=Condition.BOOTING,
+        nmt_state=127,
+        heartbeat_age_s=0.1,
+        scan_age_s=None,
+        boot_ups=1,
+        emergencies=0,
+        last_emergency=None,
+        emergency_text="",
+        error_register=0,
+    )
+    why = "node 5: no answer to 0x1018"
+    for condition, told in ((Condition.BOOTING, "booting"), (Condition.STALE, "starting")):
+        health = dataclasses.replace(sound, condition=condition)
+        assert judge_patch(health, []) == (told, "note", ())
+        assert judge_patch(dataclasses.replace(health, complaint=why), []) == (told, "note", (why,))
+    refused = dataclasses.replace(sound, condition=Condition.REFUSED, complaint=why, refusal=why)
+    assert judge_patch(refused, []) == ("refused", "bad", (why,))
 
 
 def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> None:

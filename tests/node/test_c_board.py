@@ -187,6 +187,7 @@ class Pair:
         self.flags |= frames[-1][1][1]
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=40)
 @given(steps=steps(), wire=st.sampled_from(WIRES), counts=st.booleans())
 def test_any_course_of_events(

@@ -313,6 +313,22 @@ def test_emergency_that_the_bus_refuses_is_told_later(operational) -> None:
     assert desk.take() == [(0x084, "40 82 11 00 01 00 00 00"), SYNC_IS_OVER]
 
 
+def test_what_could_not_wait_is_in_the_history_once_however_often_it_is_tried(operational) -> None:
+    """The interface refuses frames for a while: the history still has what happened."""
+    desk = operational
+    desk.bus_refuses = True
+    for number in range(10):
+        desk.node.on_frame(0x80, bytes(2 + number % 2), desk.t_ns)
+    for _ in range(20):
+        with pytest.raises(BusError):
+            desk.run(0)
+    desk.bus_refuses = False
+    desk.run(0)
+    assert desk.take()[0] == (0x084, "10 81 11 00 00 04 00 00")  # of 20, 16 waited
+    codes = [desk.read(0x1003, sub) & 0xFFFF for sub in range(1, 9)]
+    assert codes == [0x8110] + [0x8240] * 7
+
+
 def test_controller_that_becomes_error_passive(operational) -> None:
     desk = operational
     desk.node.on_bus(BusState.PASSIVE, desk.t_ns)

@@ -22,6 +22,7 @@ from skinnode.node import NOT_CONFIGURED, FileMemory, NmtState, NodeRunner, Patc
 from skinnode.node.memory import Kept
 from skinnode.protocol.eds_files import eds_text
 from skinnode.transport import CanPort
+from skinnode.transport.bus_state import BusState
 
 MS = 1_000_000
 ON, OFF = "04 01 00 00 00 00 00 00", "04 00 00 00 00 00 00 00"
@@ -213,6 +214,19 @@ class TestBitRate:
         desk.run(1)
         assert desk.take() != []
         assert desk.sdo("40 00 10 00 00 00 00 00") == "43 00 10 00 00 00 00 00"
+
+    def test_what_the_controller_says_in_between_is_told_afterwards(self, make: Callable) -> None:
+        """While the nodes of a bus change their bit rates one after the other, errors are likely."""
+        desk = make(set_bit_rate=lambda _: None)
+        desk.frame(0x7E5, ON)
+        desk.frame(0x7E5, "13 00 03 00 00 00 00 00")
+        desk.frame(0x7E5, "15 64 00 00 00 00 00 00")  # 100 ms
+        desk.run(150)
+        desk.node.on_bus(BusState.PASSIVE, desk.t_ns)
+        desk.run(49)
+        assert desk.take() == []
+        desk.run(1)
+        assert desk.take() == [(0x084, "20 81 11 00 00 00 00 00")]
 
     def test_delay_of_nothing(self, make: Callable) -> None:
         rates: list[int] = []

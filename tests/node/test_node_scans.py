@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from skinnode.errors import BusError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.node import THRIFTY, Pacing
+from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
@@ -302,6 +305,31 @@ def test_disabling_the_chunk_pdo_under_way_is_told_by_the_summary(operational) -
     assert [data[:5] for can_id, data in frames if can_id == CHUNK] == ["00 03", "01 03", "02 03", "03 03"]
 
 
+class Refusing(list[tuple[int, bytes, int]]):
+    """What is sent, but for the frame with this number, which the bus refuses."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self._left = number
+
+    def append(self, item: tuple[int, bytes, int]) -> None:
+        self._left -= 1
+        if self._left == -1:
+            raise BusError("can0: no buffer space available")
+        super().append(item)
+
+
+def assembled(assembler: ScanAssembler, desk) -> list[int]:
+    """Counters of the complete scans in what was sent."""
+    scans = []
+    for can_id, data, t_ns in desk.sent:
+        if can_id in (CHUNK, SUMMARY):
+            scans.append((assembler.on_chunk if can_id == CHUNK else assembler.on_summary)(data, t_ns))
+    desk.take()
+    scans.append(assembler.poll(desk.t_ns))
+    return [each.counter for each in scans if each is not None and each.complete]
+
+
 class TestChangedOnly:
     @pytest.fixture
     def changed(self, operational):
@@ -350,6 +378,40 @@ class TestChangedOnly:
         ohm[0, 0] = np.inf
         desk.source.ohm = ohm
         assert list(codes_of(scan(desk, "02"))) == [0]
+
+    @pytest.mark.parametrize("refused", range(5))  # each chunk of a full scan, and the summary
+    def test_a_frame_that_the_bus_refuses_costs_one_scan(self, changed, refused: int) -> None:
+        """Receivers forget all codes at an incomplete scan, and the node knows that it was one."""
+        desk = changed
+        desk.write(0x2020, 3, 0, 2)  # no refresh
+        assembler = ScanAssembler(desk.node.profile, counter_overflow=240)
+        complete = []
+        for counter in range(1, 7):
+            desk.source.ohm = desk.source.ohm * np.where(np.arange(6) < 3, 0.999, 1.0)
+            if counter == 3:
+                desk.write(0x2020, 1, 1, 1)  # a full scan
+                desk.sent = Refusing(refused)
+            end_ns = desk.t_ns + PERIOD_MS * 1_000_000
+            with contextlib.suppress(BusError):
+                desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
+            while desk.t_ns < end_ns:
+                with contextlib.suppress(BusError):
+                    desk.run((end_ns - desk.t_ns) * 1e-6)
+            complete += assembled(assembler, desk)
+        assert complete == [1, 2, 4, 5, 6]
+
+    def test_skipped_scans_cost_no_more_than_themselves(self, changed) -> None:
+        desk = changed
+        desk.write(0x2020, 3, 0, 2)
+        assembler = ScanAssembler(desk.node.profile, counter_overflow=240)
+        complete = []
+        for counter in range(1, 9):
+            desk.source.ohm = desk.source.ohm * np.where(np.arange(6) < 3, 0.999, 1.0)
+            desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
+            desk.run(0 if counter in (3, 4) else PERIOD_MS)
+            complete += assembled(assembler, desk)
+        assert desk.node.overruns == 1
+        assert complete == [1, 2, 3, 4, 6, 7, 8]
 
     def test_start_tare_and_mode_make_the_next_scan_full(self, changed) -> None:
         desk = changed
@@ -489,6 +551,14 @@ class TestCommandPdo:
     def test_value_out_of_range_is_refused_and_harms_nothing(self, operational) -> None:
         assert operational.frame(0x204, "00 00 00 00 00 07") == []
         assert operational.read(0x2020, 1) == 0
+
+    def test_a_scan_that_the_bus_refuses_does_not_cost_the_mode(self, desk) -> None:
+        desk.start()
+        desk.bus_refuses = True
+        with pytest.raises(BusError):  # whoever drives it hears of it
+            desk.node.on_frame(0x204, bytes.fromhex("00 00 00 00 01 01"), desk.t_ns)
+        desk.bus_refuses = False
+        assert desk.read(0x2020, 1) == 1
 
     def test_too_short_is_told_until_it_is_right(self, operational) -> None:
         desk = operational

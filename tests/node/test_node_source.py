@@ -239,7 +239,9 @@ class TestSelfTest:
         del desk.source.read
         assert self.result(desk) == (2, 1, 0, 0.0, 0, 0, 0, 0)
 
-    def test_a_reset_forgets(self, desk) -> None:
-        self.result(desk)
+    def test_reset_node_forgets_and_reset_communication_does_not(self, desk) -> None:
+        result = self.result(desk)
+        desk.frame(0, "82 00")
+        assert [desk.read(0x2023, sub) for sub in (1, 3)] == [result[0], result[2]]
         desk.frame(0, "81 00")
         assert desk.read(0x2023, 1) == 0

@@ -444,6 +444,19 @@ class TestVerifyConfiguration:
         assert desk.read(0x2020, 2) == 2
         assert self.noted(desk)
 
+    def test_nor_is_one_of_which_a_value_was_refused(self, desk, memory: Breakable) -> None:
+        """The COB-ID that was chosen for TPDO1 is, at another node-ID, the default of TPDO2."""
+        desk.write(0x1800, 1, 0x8000_0184, 4)
+        desk.write(0x1800, 1, 0x285, 4)
+        self.note(desk)
+        desk.write(0x1010, 1, SAVE, 4)
+        kept = memory.load()
+        assert kept is not None
+        memory.save(replace(kept, node_id=5))
+        assert (0x085, "00 63 81 04 00 18 01 00") in cycle(desk)
+        assert desk.read(0x1800, 1) == 0x185
+        assert not self.noted(desk)
+
     def test_gone_with_the_defaults(self, desk) -> None:
         desk.write(0x2020, 2, 77, 2)
         self.note(desk)

@@ -136,6 +136,32 @@ class TestEventDriven:
         assert desk.times(PDO, start_ns) == [0, 30, 60]
         assert [data[1] for can_id, data, _ in desk.sent if can_id == PDO] == [1, 3, 6]
 
+    @pytest.mark.parametrize(("inhibit", "at_ms"), [(0, 10), (200, 20)])
+    def test_inhibit_time_that_is_shortened_is_over_sooner(self, tpdo3, inhibit: int, at_ms: int) -> None:
+        desk = tpdo3(kind=254, inhibit=0xFFFF)  # 6.5 s
+        start_ns = desk.t_ns
+        sync(desk, 1)
+        desk.write(0x1802, 1, 0x80000000 | PDO, 4)
+        desk.write(0x1802, 3, inhibit, 2)
+        desk.write(0x1802, 1, PDO, 4)
+        desk.run(10)
+        desk.take()
+        desk.node.on_frame(0x80, b"\x02", desk.t_ns)
+        desk.run(100)
+        assert desk.times(PDO, start_ns) == [at_ms]
+
+    def test_inhibit_time_from_before_a_reset_is_over(self, operational) -> None:
+        desk = operational
+        desk.write(0x1800, 1, 0x80000184, 4)
+        desk.write(0x1800, 3, 0xFFFF, 2)
+        desk.write(0x1800, 1, 0x184, 4)
+        assert sync(desk, 1)[0][0] == 0x184
+        desk.frame(0, "82 04")
+        desk.start()
+        desk.node.on_frame(0x80, b"", desk.t_ns)
+        desk.run(80)
+        assert [can_id for can_id, _ in desk.take()] == [0x184] * 4 + [0x284]
+
     def test_inhibit_time_is_nothing_to_a_synchronous_one(self, tpdo3) -> None:
         desk = tpdo3(kind=1, inhibit=10_000)
         assert [sync(desk, n) for n in (1, 2)] == [[(PDO, "00 01")], [(PDO, "00 02")]]

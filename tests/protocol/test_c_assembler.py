@@ -29,6 +29,7 @@ def kit_of() -> Iterator[KitOf]:
     yield from kits()
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=80)
 @given(world=worlds(), polled=st.booleans(), under_way=st.booleans(), checked=st.booleans())
 def test_any_channel(

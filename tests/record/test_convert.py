@@ -22,6 +22,7 @@ from skinnode.record.convert import convert
 from skinnode.record.journal import Header
 from skinnode.record.log_files import LogFiles
 from skinnode.transport.frame import Frame
+from skinnode.transport.frame_log import FrameLog
 from skinnode.transport.frame_log_reader import FrameLogReader
 from vcan_sim.fleet import Fleet
 
@@ -56,6 +57,15 @@ def test_a_recording_comes_back_byte_for_byte(recorded: Path, tmp_path: Path, th
     assert back.read_bytes() == recorded.read_bytes()
     assert back.with_suffix(".jsonl").read_bytes() == recorded.with_suffix(".jsonl").read_bytes()
     assert bits(middle) == bits(recorded)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
+def test_a_log_without_frames_is_no_damaged_one(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"run{suffix}"
+    FrameLog(path, ("can0",)).close()
+    reader = FrameLogReader(path)
+    assert list(reader) == []
+    assert reader.damages == []
 
 
 def test_a_log_next_to_its_source_shares_the_journal(recorded: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
-from skinnode.config import HandConfig, load_hand
+from skinnode.config import HandConfig, SyncConfig, load_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.frames import FieldFrame
@@ -104,6 +104,24 @@ def test_with_the_baselines_it_gives_the_fields_of_the_host(
         abs(found[which].displacement_m - field.displacement_m).max() for which, field in wanted.items()
     )
     assert worst_m < 1e-12  # the same codes and baselines; the solver may have begun with another scan
+
+
+def test_a_sync_missing_from_the_log_changes_no_scan_number(tmp_path: Path) -> None:
+    """Its counter was that of a SYNC one round before."""
+    sync = SyncConfig(period_ms=25, counter_overflow=8)
+    path, hand = tmp_path / "run.log", a_hand().model_copy(update={"sync": sync})
+    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
+        time.sleep(0.8)
+    log, own = foreign(path, tmp_path), hand_file(tmp_path).model_copy(update={"sync": sync})
+    whole = [field.stamp for field in replay(log, hand=own)]
+    lines = log.read_text().splitlines(keepends=True)
+    lost = [number for number, line in enumerate(lines) if " 080#" in line][15]
+    log.write_text("".join(lines[:lost] + lines[lost + 1 :]))
+    found = [field.stamp for field in replay(log, hand=own)]
+    assert [(one.patch, one.scan) for one in found if one] == [(one.patch, one.scan) for one in whole if one]
+    times = [one.t_sync_ns for one in found if one]
+    assert times.count(0) in (1, 2)  # one for each patch that sent this scan
+    assert all(t_ns in (0, one.t_sync_ns) for t_ns, one in zip(times, whole, strict=True) if one)
 
 
 @pytest.mark.parametrize("suffix", [".log", ".mcap"])

@@ -82,6 +82,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_disk_that_is_full_at_the_end_of_a_conversion_is_an_error(source: Path) -> None:
     targets = [suffix for suffix in TARGETS if suffix != ".log"]
     with Recorder(a_hand(), source.with_name("run.mcap")) as recorder:
@@ -175,6 +176,18 @@ def test_the_frames_of_an_entry_that_cannot_be_written_are_counted(
     assert events["withheld"]["at"] == 2  # a replay applies it after the two frames that are in the log
     assert events["dropped"]["frames"] == 3
     assert json.loads(recording.lines[-1])["frames"] == 3
+
+
+def test_a_full_queue_loses_frames_but_no_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A replay without an event would decode all later scans with the wrong baseline."""
+    with Recorder(a_hand(), tmp_path / "run.log") as recorder:
+        recorder.received("can0", [a_frame(1)])
+        monkeypatch.setattr("skinnode.record.recorder.CAPACITY", 0)
+        recorder.received("can0", [a_frame(2)])
+        recorder.withheld("p0")
+    assert (recorder.stats().frames, recorder.stats().dropped) == (1, 1)
+    _, *events = (tmp_path / "run.jsonl").read_text().splitlines()
+    assert [json.loads(line)["event"] for line in events] == ["withheld", "dropped", "ended"]
 
 
 def test_an_event_that_cannot_be_written_is_no_lost_frame(

@@ -21,9 +21,9 @@ from typer.testing import CliRunner
 
 from skinnode.cli._contacts import contact_tables
 from skinnode.cli.main import app
-from skinnode.config import HandConfig, load_hand, parse_hand
+from skinnode.config import BringUpConfig, HandConfig, load_hand, parse_hand
 from skinnode.errors import ConfigError
-from skinnode.host import Host
+from skinnode.host import Condition, Host
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, replay
 from skinnode.transport.frame import Frame
@@ -95,6 +95,22 @@ def test_a_replay_gives_the_bits_of_the_live_run(
         assert abs(other.stamp.t_receive_ns - field.stamp.t_receive_ns) <= 2000
     with pytest.raises(ConfigError, match="exists"):
         Recorder(hand, path)
+
+
+def test_health_follows_the_heartbeat_period_of_the_nodes(tmp_path: Path) -> None:
+    """A guest keeps the period that the bus's master has set, whatever its hand file says."""
+    hand, path = a_hand(), tmp_path / "run.log"
+    slow = hand.model_copy(update={"bring_up": BringUpConfig(heartbeat_ms=1000)})
+    with Fleet(slow), Recorder(slow, path) as recorder, Host.from_config(slow, tap=recorder):
+        time.sleep(2.5)
+    first, *events = path.with_suffix(".jsonl").read_text().splitlines(keepends=True)
+    header = json.loads(first)
+    assert header["hand"].pop("bring_up") == {"heartbeat_ms": 1000}
+    path.with_suffix(".jsonl").write_text("".join([json.dumps(header), "\n", *events]))
+    run = replay(path)
+    conditions = [run.health(field.stamp.patch).condition for field in run if field.stamp is not None]
+    assert len(conditions) > 5  # a hundred, unless the machine is busy
+    assert Condition.LOST not in conditions
 
 
 def test_python_can_reads_what_was_written(tmp_path: Path) -> None:

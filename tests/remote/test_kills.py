@@ -83,6 +83,7 @@ def test_a_program_may_start_before_the_daemon(
     eventually(lambda: counts(program)["patches"]["p1"]["received"] > 5)
 
 
+@pytest.mark.long
 def test_the_daemon_is_killed_and_returns(start: Callable[..., Process], port: int) -> None:
     daemon = start().wait_until_up()
     with sk.connect("hand", port=port) as hand:

@@ -27,6 +27,7 @@ def runs(*fields: sk.FieldFrame | None) -> set[int]:
     return {each.stamp.run for each in fields if each is not None and each.stamp is not None}
 
 
+@pytest.mark.long
 def test_fields_and_hand_frames_go_on_after_a_restart_with_an_earlier_clock(
     start: Callable[..., Process], port: int
 ) -> None:
@@ -48,6 +49,7 @@ def test_fields_and_hand_frames_go_on_after_a_restart_with_an_earlier_clock(
         assert hands.late < 10  # a starved machine delays some fields; an earlier clock would delay all
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [

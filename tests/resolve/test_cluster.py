@@ -6,8 +6,10 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -15,14 +17,16 @@ from typer.testing import CliRunner
 
 import skinnode
 from skinnode.cli.main import app
+from skinnode.config import parse_hand
 from skinnode.errors import SkinError
 from skinnode.record.convert import convert
 from skinnode.resolve import cluster
 from skinnode.resolve.cluster import Cluster
 from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.plan import make_plan
-from skinnode.resolve.recording import recording_at
+from skinnode.resolve.recording import Recording, recording_at
 from skinnode.resolve.run import run, work_folder
+from skinnode.resolve.units import Unit
 
 pytest.importorskip("distributed")
 pytestmark = [
@@ -95,6 +99,35 @@ def test_a_worker_that_is_killed_changes_nothing(lan: Lan, recording: Path, tmp_
     solve_on(lan, recording, tmp_path / "out", tell)
     assert doomed.wait() != 0
     assert (tmp_path / "out" / "run.parquet").read_bytes() == wanted.read_bytes()
+
+
+@dataclass(frozen=True)
+class Slow(Unit):
+    """Unit that takes so long that two commands want its result at the same time."""
+
+    def run(self, parts: PartFiles) -> None:
+        time.sleep(1.0)
+        with parts.new(self.key) as part:
+            part.summary = None
+
+
+def test_two_commands_on_one_cluster_have_their_own_parts(tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    hand = parse_hand({"buses": [{"name": "can0"}], "patches": [{"name": "p0", "node_id": 5}]})
+    unit = Slow(Recording(tmp_path / "run.log", False, ()), hand)
+    folders = [tmp_path / "one", tmp_path / "other"]
+    for folder in folders:
+        folder.mkdir()
+    with ExitStack() as stack:
+        lan = stack.enter_context(LocalCluster(1, 1, processes=False, dashboard_address=None))  # type: ignore[no-untyped-call]
+        commands = [stack.enter_context(Cluster(lan.scheduler_address, folder)) for folder in folders]
+        for command in commands:
+            command.submit(unit)
+        for command in commands:
+            while not command.finished(0.5):
+                pass
+    assert [unit.key in PartFiles(folder) for folder in folders] == [True, True]
 
 
 def test_a_cluster_that_goes_is_named_and_the_next_run_continues(

@@ -19,12 +19,14 @@ from rosbags.highlevel import AnyReader
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
-from skinnode.config import HandConfig, load_hand
+from skinnode.config import HandConfig, load_hand, parse_hand
 from skinnode.errors import SkinError
+from skinnode.host import Host
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
+from skinnode.process import clock
 from skinnode.process.closing import Closing
-from skinnode.record import replay
+from skinnode.record import Recorder, replay
 from skinnode.record.convert import convert
 from skinnode.record.open_recording import open_recording
 from skinnode.resolve import processes, units
@@ -33,7 +35,12 @@ from skinnode.resolve.part_files import PartFiles
 from skinnode.resolve.plan import make_plan
 from skinnode.resolve.recording import recording_at
 from skinnode.resolve.run import WORK_FOLDER, run, work_folder
+from skinnode.resolve.scan_capture import Capture, CapturedScan
 from skinnode.resolve.settings import variants
+from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
+
+from .conftest import SMALL
 
 
 class InTurn(Closing):
@@ -90,8 +97,7 @@ def messages_in(path: Path | str) -> list[tuple[object, ...]]:
 @pytest.mark.parametrize(
     ("kind", "count"),
     [
-        ("mcap", 2),
-        *(pytest.param(*each, marks=pytest.mark.long) for each in (("mcap", 1), ("parquet", 2))),
+        *(pytest.param(*each, marks=pytest.mark.long) for each in (("mcap", 2), ("mcap", 1), ("parquet", 2))),
         ("parquet", 1),
     ],
 )
@@ -110,6 +116,7 @@ def test_the_file_is_the_one_that_convert_writes(
     assert result["faults"] == result["notes"] == []
 
 
+@pytest.mark.long
 def test_the_file_of_a_damaged_recording_is_the_one_that_convert_writes(
     recording: Path, tmp_path: Path, in_turn: None
 ) -> None:
@@ -172,6 +179,7 @@ def test_a_calibration_of_one_patch_changes_its_forces_only(recording: Path, tmp
     assert forces > 10
 
 
+@pytest.mark.long
 def test_a_replay_of_a_result_gives_its_fields(recording: Path, tmp_path: Path, in_turn: None) -> None:
     """The journal of the MCAP file contains the options with which it was solved."""
     setting = "solver.method=posterior"
@@ -250,6 +258,23 @@ def test_parts_of_another_version_are_not_used(
     assert len(job_of(recording, tmp_path).units(parts)) == every
 
 
+def test_the_order_of_the_fields_does_not_depend_on_how_the_buses_are_divided(recording: Path) -> None:
+    """A command may continue with another number of processes, and then reads parts of both divisions."""
+    opened, hand = recording_at(recording, None)
+    divisions = [[("can0", "can1")], [("can0",), ("can1",)]]
+    places = []
+    for division in divisions:
+        scans = [
+            item
+            for buses in division
+            for item in Capture(opened, hand, buses)
+            if isinstance(item, CapturedScan)
+        ]
+        places.append({(scan.patch, scan.stamp.scan): scan.place for scan in scans})
+    assert places[0] == places[1]
+    assert len(set(places[0].values())) == len(places[0]) > 250
+
+
 def foreign(recording: Path, folder: Path, lines: str = "") -> tuple[Path, Path]:
     """Write the recording as another master's log, and a hand file with ``lines`` in each patch."""
     opened = open_recording(recording)
@@ -291,6 +316,87 @@ def test_parts_of_another_baseline_are_not_used(recording: Path, tmp_path: Path)
     (tmp_path / "rest.txt").unlink()
     with pytest.raises(SkinError, match=r"rest\.txt: cannot be read"):
         units.run_unit(changed.solves[0], str(tmp_path), identity(), "a worker")
+
+
+def test_a_layout_file_is_found_from_any_folder(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its name is relative to the folder of the command, and not to that of a worker."""
+    layout = PatchLayout.preset(
+        "staggered", upper_wires=4, upper_electrodes=4, lower_wires=12, lower_electrodes=4
+    )
+    np.savez(
+        tmp_path / "layout.npz",
+        upper_m=layout.upper_m,
+        lower_m=layout.lower_m,
+        resistivity_ohm_per_m=layout.resistivity_ohm_per_m,
+    )
+    monkeypatch.chdir(tmp_path)
+    changed = variants(['patches.p0.layout={file="layout.npz"}'])
+    (job,) = make_plan([recording_at(recording, None)], changed, tmp_path, ".parquet", 1)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    units.run_unit(job.captures[0], str(tmp_path), identity(), "a worker")
+    assert job.captures[0].finished(PartFiles(tmp_path))
+
+
+def test_the_layout_that_a_node_has_supplied_can_be_replaced(tmp_path: Path, in_turn: None) -> None:
+    def a_hand(**layout: object) -> HandConfig:
+        bus = {"name": "can0", "interface": "timed", "channel": "supplied"}
+        patch = {"name": "p0", "node_id": 5, "layout": {**SMALL, **layout}, "tolerances": "exact"}
+        return parse_hand({"buses": [bus], "patches": [patch], "sync": {"period_ms": 25}})
+
+    high, hand, log = a_hand(height_m=3e-3), a_hand(coordinates="node"), tmp_path / "run.log"
+    with (
+        VirtualClock(),
+        Fleet(high),
+        Recorder(hand, log) as recorder,
+        Host.from_config(hand, tap=recorder),
+    ):
+        clock.sleep(0.5)
+
+    def rest_m(folder: str, *options: str) -> Any:
+        (result,) = resolve(log, "-o", tmp_path / folder, "--format", "mcap", "--processes", 1, *options)
+        run = replay(result["file"])
+        assert len(list(run)) == result["fields"] > 5
+        return run.layout("p0").upper_m
+
+    planned_m = hand.patches[0].layout.build().upper_m
+    np.testing.assert_allclose(rest_m("own"), planned_m + np.array([0.0, 0.0, 1e-3]), rtol=0, atol=1e-8)
+    preset = ("--set", "patches.p0.layout.coordinates=preset")
+    np.testing.assert_array_equal(rest_m("preset", *preset), planned_m)
+    height = ("--set", "patches.*.layout.height_m=4e-3")
+    np.testing.assert_allclose(
+        rest_m("higher", *preset, *height), planned_m + np.array([0.0, 0.0, 2e-3]), atol=1e-12
+    )
+    assert "only with patches.p0.layout.coordinates=preset" in refusal(log, "-o", tmp_path / "x", *height)
+
+
+_KILLED = """
+import os, signal
+from skinnode.cli.main import main
+from skinnode.record.parquet_file import ParquetFile
+from skinnode.resolve import processes
+from tests.resolve.test_resolve import InTurn
+ParquetFile.close = lambda table: os.kill(os.getpid(), signal.SIGKILL)
+processes.Processes = InTurn
+main()
+"""
+"""The command, which is killed before the first file of results is complete."""
+
+
+@pytest.mark.long
+def test_a_command_killed_while_it_writes_a_result_leaves_only_the_work_folder(
+    recording: Path, tmp_path: Path, in_turn: None
+) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", _KILLED, "resolve", str(recording), "-o", str(out), "--processes", "1"]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], check=False, timeout=120.0)
+    assert done.returncode == -signal.SIGKILL
+    assert os.listdir(out) == [WORK_FOLDER]
+    resolve(recording, "-o", out, "--processes", 1)
+    assert os.listdir(out) == ["run.parquet"]
 
 
 class Killed(BaseException):
@@ -395,6 +501,7 @@ def test_two_commands_do_not_share_a_folder(recording: Path, tmp_path: Path) -> 
     assert "allowed: a folder that no other skinnode resolve is using" in said
 
 
+@pytest.mark.long
 def test_a_damaged_recording_is_solved_and_named(recording: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.log"
     data = recording.read_bytes()

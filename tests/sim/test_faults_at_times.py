@@ -12,6 +12,7 @@ import skinnode as sk
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.process import clock
+from skinnode.transport import CanPort
 from vcan_sim.bus_attacker import BusFaults
 from vcan_sim.fault_schedule import FaultSchedule, TimedFault
 from vcan_sim.fault_text import parse_changes, parse_values, text_of
@@ -107,6 +108,15 @@ def test_what_is_printed_is_parsed_to_the_same_faults() -> None:
         ("can0:seed=-1", "seed: got -1, allowed: a non-negative integer"),
         ("palm:lost=2", "lost: got 2.0, allowed: a fraction from 0 to 1"),
         ("palm:open_upper=7", "palm: open_upper: got 7, allowed: an integer from 0 to 3"),
+        ("palm:struck=16", "palm: struck: got 16, allowed: an integer from 0 to 15"),
+        ("palm:struck=-2", "struck: got -2, allowed: a non-negative integer"),
+        ("palm:miscounted_by=-256", "miscounted_by: got -256, allowed: an integer that 256 does not divide"),
+        ("palm:babble_per_s=2e9", "babble_per_s: got 2000000000.0, allowed: 0, or a number from 1e-06 to"),
+        ("palm:emcy_per_s=1e-305", "emcy_per_s: got 1e-305, allowed: 0, or a number from 1e-06 to 100000"),
+        ("palm:restart_every_s=1e300", "restart_every_s: got 1e+300, allowed: 0, or a number from 0.001 to"),
+        ("palm:restart_every_s=1e-10", "restart_every_s: got 1e-10, allowed: 0, or a number from 0.001 to"),
+        ("can0:rogue_sync_per_s=3e9", "rogue_sync_per_s: got 3000000000.0, allowed: 0, or a number from 1e"),
+        ("can0:rogue_nmt_per_s=-1", "rogue_nmt_per_s: got -1.0, allowed: 0, or a number from 1e-06 to"),
     ],
 )
 def test_a_bad_text_is_one_line_and_changes_nothing(text: str, words: str) -> None:
@@ -286,6 +296,20 @@ def test_an_error_passive_controller_is_reported(virtual: VirtualClock) -> None:
     assert "0x8120" in newest
 
 
+def test_without_power_nothing_becomes_due(virtual: VirtualClock) -> None:
+    with Fleet(HAND) as fleet, CanPort(HAND.buses[0]):  # the port acknowledges the frames
+        fleet.inject(Faults(babble_per_s=10.0), "palm")
+        clock.sleep(0.55)
+        before = fleet.injected("palm").babbled
+        assert 3 <= before <= 5  # the node boots first, and an idle node notices a fault after a while
+        fleet.inject(Faults(babble_per_s=10.0, unplugged=True), "palm")
+        clock.sleep(2.0)
+        assert fleet.injected("palm").babbled == before
+        fleet.inject(Faults(babble_per_s=10.0), "palm")
+        clock.sleep(0.55)
+        assert before + 2 <= fleet.injected("palm").babbled <= before + 5
+
+
 def test_a_second_node_with_the_node_id(virtual: VirtualClock) -> None:
     plan = scene({"where": "palm", "fault": "duplicate_node_id", "from_s": 0.5, "to_s": 2.0})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
@@ -308,6 +332,13 @@ def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> No
     with Fleet(HAND, scene=scene({"where": "palm", "fault": "silent"})) as fleet:
         clock.sleep(1.0)
     assert fleet.faults.log == ()
+
+
+def test_a_fleet_of_real_time_plays_its_faults_in_virtual_time() -> None:
+    fleet = Fleet(HAND, scene=scene({"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 0.4}))
+    with VirtualClock(), fleet, sk.Host.from_config(HAND):
+        until(fleet, 0.6)
+        assert events(fleet) == [(0.2, "palm:frozen on"), (0.4, "palm:frozen off")]
 
 
 def test_the_schedule_of_a_fleet_that_is_started_again_goes_on(virtual: VirtualClock) -> None:

@@ -206,6 +206,15 @@ def test_an_attacker_of_a_bus_without_exact_times() -> None:
         fleet.faults.inject("none")
 
 
+def test_an_attacker_with_nothing_to_do_for_centuries() -> None:
+    """A wait in real time has a limit, which must not end the thread of the rogue device."""
+    with Fleet(hand("virtual")) as fleet:
+        fleet.faults.inject("can0:starved=1e-300")
+        clock.sleep(0.1)
+        fleet.faults.inject("can0:starved=0,rogue_sync_per_s=200")
+        eventually(lambda: fleet.passed("can0").heard.total() >= 10)
+
+
 def test_reading_a_full_queue_is_no_polling() -> None:
     """A thread that takes frame after frame does not wait: time stands still meanwhile."""
     with VirtualClock() as time:

@@ -19,6 +19,7 @@ from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.device_time import restore_time_us
 from skinnode.protocol.summary import unpack_summary
 from skinnode.transport import CanPort, Frame
+from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 from vcan_sim.virtual_time import VirtualClock
 
@@ -135,6 +136,20 @@ def test_counters_are_those_of_the_bus_and_a_tare_is_no_scan() -> None:
         assert new.frames_sent - old.frames_sent >= len(seen) == 3 * 17
 
 
+def test_a_scan_of_a_frozen_converter_has_the_truth_of_its_time() -> None:
+    plan = hand(patches=1)
+    with Manager(plan.buses[0]) as manager, Fleet(plan) as fleet:
+        manager.booted(5)
+        manager.port.send(0x000, b"\x01\x00")
+        fleet.inject(Faults(frozen=True))
+        for _ in range(2):
+            summary = unpack_summary(manager.scan(5)[-1].data)
+            device_us = restore_time_us(summary.device_time_us, time.monotonic_ns() // 1000)
+            fleet.truth_m("p0", device_us)  # raises LookupError for a time that is not a scan's
+            assert 0 <= device_us - fleet.patches["p0"].last_read_ns // 1000 + 63 < 64
+    assert fleet.injected("p0").frozen >= 2
+
+
 def test_truth_of_a_scan_nobody_sent() -> None:
     with Fleet(hand()) as fleet:
         with pytest.raises(LookupError, match="p1: no reading at device time 7"):
@@ -194,3 +209,8 @@ def test_a_bus_that_does_not_open_leaves_nothing_running() -> None:
     assert set(threading.enumerate()) == threads
     with pytest.raises(ConfigError, match="--channel"):
         Fleet(plan, channel="other")
+
+
+def test_a_patch_without_checks_must_exist() -> None:
+    with pytest.raises(ConfigError, match="unchecked: got 'p7', allowed: a patch of the hand: p0, p1"):
+        Fleet(hand(), unchecked=["p0", "p7"])

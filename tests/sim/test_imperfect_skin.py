@@ -486,6 +486,19 @@ def test_motion_between_rows_is_linear_over_a_millisecond_at_most(row_time_s: fl
     assert off[3] < 1e-17
 
 
+def test_a_single_upper_wire_is_read_at_the_time_of_the_scan() -> None:
+    layout = PatchLayout.preset("staggered", upper_wires=1, upper_electrodes=5)
+
+    def sinking(t_s: float) -> Array:
+        return np.asarray(layout.upper_m - np.array([0.0, 0.0, 1e-4 * t_s]))
+
+    skin = PhysicalPatch(layout, Imperfections(row_time_s=1e-3))
+    np.testing.assert_array_equal(skin.upper_m(0.5, sinking), sinking(0.5))
+    expected = resistance_ohm(layout, sinking(0.5))
+    np.testing.assert_allclose(skin.resistance_ohm(0.5, sinking), expected, rtol=1e-12)
+    assert np.isfinite(PhysicalPatch(layout, ORDINARY_PATCH).resistance_ohm(0.5, sinking)).all()
+
+
 def test_each_upper_wire_has_the_temperature_of_its_own_time() -> None:
     sizes = Imperfections(warming_k=20.0, temperature_per_k=5e-3, warming_s=0.1, row_time_s=0.02)
     found = PhysicalPatch(LAYOUT, sizes).resistance_ohm(0.05, at_rest) / direct_sum(LAYOUT, LAYOUT.upper_m)

@@ -112,6 +112,7 @@ def in_virtual_time(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return folder, run(folder)
 
 
+@pytest.mark.long
 def test_the_same_suite_in_virtual_and_in_real_time(in_virtual_time: Run, tmp_path: Path) -> None:
     for done, passed, skipped in ((in_virtual_time[1], 4, 0), (run(tmp_path, "--skin-bus=virtual"), 2, 2)):
         assert re.search(rf"1 failed, {passed} passed(, {skipped} skipped)? in", done.stdout), done.stdout
@@ -139,6 +140,18 @@ def test_a_scene_of_faults_is_kept_without_a_plot(tmp_path: Path) -> None:
     )
     printed = run(tmp_path, "test_faults.py").stdout
     assert "test_faults.py_test_fails: trace.log, truth.npz, scene.json\n" in printed
+
+
+def test_a_failed_set_up_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "test_early.py").write_text(
+        "import pytest\n\n\n@pytest.fixture\ndef ready(skin_hand):\n    skin_hand('hand.toml')\n"
+        "    raise AssertionError\n\n\ndef test_early(ready):\n    pass\n"
+    )
+    printed = run(tmp_path, "test_early.py").stdout
+    assert "1 error in" in printed
+    assert "test_early.py_test_early: trace.log, truth.npz\n" in printed
+    kept = tmp_path / "skin-kept" / "test_early.py_test_early"
+    assert np.load(kept / "truth.npz")["palm displacement_m"].shape[1:] == (4, 4, 3)
 
 
 EXAMPLE = str(Path(__file__).parents[2] / "examples" / "hand.toml")

@@ -199,6 +199,15 @@ def test_a_bus_that_cannot_be_opened_leaves_no_folder(tmp_path: Path) -> None:
     assert trace_of(folder).read_text() == ""
 
 
+def test_a_fleet_that_does_not_start_leaves_no_folder(tmp_path: Path) -> None:
+    plan, folder = hand("virtual"), tmp_path / "run"
+    closed = Fleet(plan.on("timed", None))  # needs virtual time
+    for _ in range(2):
+        with pytest.raises(BusError), Recording(folder, Fleet(plan)), closed:
+            pass
+        assert not folder.exists()
+
+
 FOREIGN = """(1.000000) can0 00000123#00
 (1.000000) can0 18FF0104#00
 (1.000000) can0 20000004#0000000000000000

@@ -435,6 +435,11 @@ SLIDE = '[[touches.motions]]\nkind = "slide"\nby_m = [0.001, 0.0]\nfrom_s = 1.3\
         (BODY + TOUCH.replace("to_s = 2.0", "to_s = 0.5"), "10:1", ["to_s", "0.5", "later than from_s"]),
         (BODY + TOUCH + SLIDE.replace("to_s = 1.7", "to_s = 1.2"), "16:1", ["motions[0].to_s", "1.2"]),
         (BODY + TOUCH + SLIDE.replace("to_s = 1.7", "to_s = 2.7"), "16:1", ["motions[0].to_s", "2.7"]),
+        (
+            BODY + TOUCH.replace("to_s = 2.0", "to_s = 1.05") + "ramp_s = 0.02\n",
+            "10:1",
+            ["touches[0].to_s", "1.05", "at least 1.06 s, two time steps"],
+        ),
         (BODY + TOUCH + "ramp_s = 0.8\n", "12:1", ["ramp_s", "0.8", "at most half"]),
         (BODY + TOUCH + "force_n = 1.0\n", "12:1", ["force_n", "either"]),
         (BODY + TOUCH.replace("2e-4", "nan"), "11:1", ["depth_m", "nan", "(m)"]),

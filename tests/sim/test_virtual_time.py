@@ -19,7 +19,7 @@ import pytest
 from skinnode.process import clock
 from vcan_sim.event_loop import run
 from vcan_sim.timed_interface import MOST_STATIONS
-from vcan_sim.virtual_time import START_NS, Deadlock, VirtualClock
+from vcan_sim.virtual_time import READINGS, START_NS, Deadlock, VirtualClock
 
 
 def test_waiting_takes_virtual_time_and_computing_none() -> None:
@@ -42,6 +42,15 @@ def test_time_passes_for_a_thread_that_polls_it() -> None:
         while clock.monotonic() < end_s:
             pass
         assert clock.monotonic() == pytest.approx(end_s, abs=1e-3)
+
+
+def test_a_thread_that_waits_between_its_readings_does_not_poll() -> None:
+    times = READINGS + 100
+    with VirtualClock():
+        for _ in range(times):
+            clock.monotonic()
+            clock.sleep(1e-3)
+        assert clock.monotonic_ns() == START_NS + times * 1_000_000
 
 
 def test_outside_and_in_other_threads_time_is_the_systems() -> None:
@@ -175,6 +184,35 @@ def test_a_deadlock_is_reported_with_the_threads_that_wait() -> None:
 
     with pytest.raises(Deadlock, match="waiting: 'never'"):
         wait_for_each_other()
+
+
+@pytest.mark.parametrize("naps", [0, 3])
+def test_an_exception_of_a_timed_function_is_the_first_threads(naps: int) -> None:
+    """Whichever thread happens to wait when the function is called; all threads continue."""
+
+    def fail() -> None:
+        raise ValueError("a frame that must not be")
+
+    def nap() -> None:
+        for _ in range(naps):
+            clock.sleep(0.5e-3)
+        event.wait()
+        ended.append(clock.monotonic_ns() - START_NS)
+
+    ended: list[int] = []
+    with VirtualClock() as time_here:
+        event = clock.event()
+        thread = clock.thread(nap, "naps")
+        thread.start()
+        time_here.call_at(START_NS + 1_000_000, fail)
+        with pytest.raises(ValueError, match="a frame that must not be"):
+            clock.sleep(1.0)
+        assert clock.monotonic_ns() == START_NS + 1_000_000
+        clock.sleep(1.0)  # the wait that has failed does not end this one
+        assert clock.monotonic_ns() == START_NS + 1_001_000_000
+        event.set()
+        thread.join()
+    assert ended == [1_001_000_000]
 
 
 def test_threads_left_behind_are_named() -> None:

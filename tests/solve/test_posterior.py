@@ -388,6 +388,7 @@ def test_model_error_covers_a_layer_of_another_thickness(staggered, thicker):
     assert rms[1] < 1.15 < 3 < rms[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [1 / 3, 1.0, 3.0])
 @pytest.mark.parametrize("lower_wires", [60, 150])
 def test_noise_is_found_where_there_are_equations_to_spare(noise_tracker, factor, lower_wires):
@@ -657,6 +658,7 @@ def test_threads_do_not_change_a_bit(staggered):
     assert len(set(found)) == 1
 
 
+@pytest.mark.long
 def test_number_of_threads_of_the_algebra_does_not_change_a_bit(staggered, tmp_path):
     """In a process with one BLAS thread and in one with two."""
     np.save(tmp_path / "frames.npy", np.array(scenes(staggered)))

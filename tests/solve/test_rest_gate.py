@@ -69,6 +69,7 @@ def test_the_field_at_rest_is_zero_and_says_so() -> None:
     np.testing.assert_allclose(field.residual, 1e-3, rtol=0.6)
 
 
+@pytest.mark.long
 def test_the_deviations_at_rest_follow_the_noise_of_the_stream() -> None:
     rng = np.random.default_rng(10)
     follower = tracker(1e-4)

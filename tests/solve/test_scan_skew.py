@@ -127,6 +127,24 @@ def test_after_a_gap_the_past_is_not_used():
     assert field.displacement_std_m.max() < 1e-5  # of 0.4 mm
 
 
+def test_a_long_scan_period_is_no_gap():
+    slow = 150.0  # scans every 3 s
+    times = slow * PERIOD_S * np.arange(14)
+    depth, row_s = (lambda t_s: pressing(t_s / slow)), slow * ROW_S
+    fields = []
+    for stamped in (True, False):
+        rng, solver = np.random.default_rng(1), tracker(row_time_s=row_s, scan_period_s=slow * PERIOD_S)
+        for t_s in times:
+            if stamped:
+                solver.t_ns = round(t_s * SECOND_NS)
+            rows = [truth_m(depth, t_s + u * row_s)[u] for u in WIRES]
+            ohm = frame_ohm(SMALL, np.stack(rows)) * (1.0 + SIGMA * rng.standard_normal(SMALL.shape))
+            fields.append(solver.update(ohm))
+    for with_times, without in zip(fields[:14], fields[14:], strict=True):
+        np.testing.assert_array_equal(with_times.displacement_m, without.displacement_m)
+        np.testing.assert_array_equal(with_times.displacement_std_m, without.displacement_std_m)
+
+
 @pytest.mark.parametrize("jump_s", [0.101, 0.109, 0.113, 0.119])
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 def test_the_standard_deviations_cover_an_onset_and_a_release_between_two_scans(method, jump_s):
@@ -328,3 +346,20 @@ def test_a_new_contact_may_not_have_been_there_when_the_first_wire_was_sampled()
     assert found.normal_force_std_n >= 2.0 * np.sqrt(share * (1.0 - share))
     assert found.normal_force_std_n < 2.0
     np.testing.assert_array_equal(found.centroid_m[:2], [pitch, 4 * pitch])
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_field_without_a_solution_does_not_say_that_a_contact_is_gone(late):
+    skew, pitch, rate_n_s = ScanSkew(SMALL, ROW_S, PERIOD_S), SMALL.pitch_m, 3.0
+    for number in range(6):
+        t_s = PERIOD_S * number
+        seen = contact((pitch, 3 * pitch), 2.0 + rate_n_s * (t_s + 3 * ROW_S))
+        field = field_of(np.full(SMALL.upper_m.shape, 1e-4 * number), contacts=(seen,))
+        if number == 4:
+            nothing, contradicts = np.zeros(len(WIRES), bool), field_of(field.displacement_m, 1e-6)
+            late_field = field_of(field.displacement_m, np.inf)
+            field = late_field if late else amended(contradicts, distrust="wrong", wires_trusted=nothing)
+        found = skew.at_first_wire(field, None)
+    (last,) = found.contacts
+    assert last.normal_force_n == pytest.approx(2.0 + rate_n_s * t_s, abs=1e-12)
+    assert last.normal_force_std_n == pytest.approx(1e-3, rel=1e-6)

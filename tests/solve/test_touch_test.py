@@ -114,6 +114,7 @@ def test_the_likelihood_ratio_is_that_of_normal_densities() -> None:
         assert found == pytest.approx(exact, abs=1.0 + 0.02 * abs(exact))
 
 
+@pytest.mark.long
 def test_false_alarms_in_a_hundred_patch_hours_agree_with_the_stated_rate() -> None:
     """Simulated in the space of the statistic, at 20 alarms an hour: 2,000 are expected at most."""
     rate, hours = 20.0, 100.0

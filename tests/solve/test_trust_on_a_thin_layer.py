@@ -6,6 +6,7 @@ import itertools
 from typing import Any
 
 import numpy as np
+import pytest
 
 import skinnode as sk
 from skinnode.config import parse_hand
@@ -45,6 +46,7 @@ PRESSES = [(ON, 2.0, 2e-3), (BETWEEN, 2.0, 2e-3), (ON, 1.0, 3e-3)]
 """Place, force in N and thickness in m."""
 
 
+@pytest.mark.long
 def test_presses_are_trusted_and_right() -> None:
     frames = trusted = far = total = 0
     for body, (at_m, force_n, thickness_m) in itertools.product(BODIES, PRESSES):

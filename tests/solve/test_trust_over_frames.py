@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.model.data_fault import FaultyPart
 from skinnode.model.layout import Float
+from skinnode.process import clock
+from skinnode.solve.checks.explanations import Group
+from skinnode.solve.checks.fault_list import FaultList
 from skinnode.solve.inputs import CodeMap
 
 LAYOUT = sk.PatchLayout.preset("staggered", upper_wires=6, upper_electrodes=5)
@@ -137,3 +141,115 @@ def test_a_fault_stays_listed_while_the_noise_is_estimated_in_each_frame() -> No
             since |= {fault.since for fault in field.faults}
             assert posterior.check.left_out is not None
     assert len(since) == 1
+
+
+def test_a_repaired_reading_is_used_again_however_often_it_was_wrong() -> None:
+    shape = LAYOUT.shape
+    faults, group = FaultList(shape), Group(FaultyPart.CROSSING, 2, 7, 50.0)
+    right, known = np.zeros(shape), np.ones(shape, bool)
+    number = 0
+    for _ in range(12):  # a loose contact
+        while faults.mask is None:
+            faults.add([group], number, number)
+            number += 1
+        waited = 0
+        while faults.mask is not None and waited < 10_000:
+            faults.follow(right, known)
+            number, waited = number + 1, waited + 1
+    assert faults.mask is None
+    assert waited == 4096
+
+
+class FrameClock(clock.SystemClock):
+    """Time passes from frame to frame, but not during a frame."""
+
+    now_ns = 0
+
+    def monotonic_ns(self) -> int:  # type: ignore[override]
+        return self.now_ns
+
+
+def test_the_deadline_of_an_exact_frame_does_not_end_the_frames_of_the_posterior() -> None:
+    rng, frames = np.random.default_rng(1), FrameClock()
+    with clock.use(frames):
+        stream = tracker(method="auto", deadline_us=5e4)
+
+        def solved(moved_m: Float, noise: float) -> sk.FieldFrame:
+            frames.now_ns += 80_000_000
+            return stream.update(reading_ohm(moved_m, rng, noise))
+
+        for moved_m in (REST_M, press_m(0.6)):  # the posterior checks the roots of such a jump
+            assert solved(moved_m, NOISE).method == "exact"
+        for _ in range(60):
+            solved(REST_M, 3e-4)
+        assert stream.method == "posterior"
+        moved_m = press_m(0.5)
+        field = solved(moved_m, 3e-4)
+    assert set(field.status) == {sk.Status.CONVERGED}
+    assert (np.abs(field.displacement_m - moved_m) < 5 * field.displacement_std_m).all()
+
+
+def test_a_field_without_a_solved_wire_has_no_contacts() -> None:
+    rng = np.random.default_rng(5)
+    posterior = sk.Posterior(LAYOUT, relative_noise=1e-4, baseline_ohm=REST_OHM)
+    assert posterior.update(reading_ohm(press_m(0.2), rng, 1e-4)).contacts
+    posterior.stop_at(0.0)
+    late = posterior.update(reading_ohm(press_m(0.3), rng, 1e-4))
+    assert set(late.status) == {sk.Status.DEADLINE}
+    assert late.contacts == ()
+    posterior.stop_at(np.inf)
+    assert posterior.update(reading_ohm(press_m(0.3), rng, 1e-4)).contacts
+
+
+def test_faults_of_the_exact_method_do_not_return_after_the_posterior() -> None:
+    least, most, steps = 0.25, 1.25, 2**24 - 4
+    step = (most - least) / steps
+    codes = CodeMap(REST_OHM, least, step, steps, step / np.sqrt(12) * REST_OHM, NOISE)
+    rng, stream = np.random.default_rng(1), tracker(method="auto", codes=codes, detect=False)
+
+    def field(noise: float, wrong: float = 1.0) -> sk.FieldFrame:
+        ohm = reading_ohm(REST_M, rng, noise)
+        ohm[2, 7] *= wrong
+        return stream.update_codes(np.rint((ohm / REST_OHM - least) / step).astype(np.uint32))[0]
+
+    for _ in range(8):
+        assert field(NOISE, wrong=0.9).method == "exact"
+    assert field(NOISE, wrong=0.9).faults
+    methods = [field(3e-4).method for _ in range(60)]
+    assert methods[-1] == "posterior"
+    for _ in range(120):
+        last = field(NOISE)
+        if last.method == "exact":
+            break
+    assert last.method == "exact"
+    assert not last.faults
+    assert last.trusted
+
+
+@pytest.mark.parametrize("method", ["exact", "posterior"])
+def test_after_a_reset_the_first_frame_is_judged_by_the_stated_noise(method: str) -> None:
+    rng, used, new = np.random.default_rng(4), tracker(method=method), tracker(method=method)
+    for _ in range(60):
+        used.update(reading_ohm(REST_M, rng, 20 * NOISE))
+    used.reset()
+    ohm = reading_ohm(press_m(0.003), rng)
+    again, expected = used.update(ohm), new.update(ohm)
+    assert expected.touched
+    assert again.touched
+    assert again.touch_odds == expected.touch_odds
+    np.testing.assert_array_equal(again.displacement_std_m, expected.displacement_std_m)
+
+
+@pytest.mark.parametrize("every", [2, 3])
+@pytest.mark.parametrize("given", [False, True])
+def test_a_touch_ends_although_the_noise_alternates(every: int, given: bool) -> None:
+    rng, stream, moved_m = np.random.default_rng(5), tracker(), press_m(0.1)
+    touched = []
+    for number in range(40):
+        noise = NOISE if number % every else 3 * NOISE
+        ohm = reading_ohm(moved_m if 6 <= number < 15 else REST_M, rng, noise)
+        field = stream.update(ohm, relative_noise=noise if given or noise > NOISE else None)
+        touched.append(field.touched)
+    assert all(touched[6:15])
+    assert not any(touched[:6])
+    assert not any(touched[20:])

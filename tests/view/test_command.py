@@ -37,6 +37,11 @@ def run(*arguments: str, code: str = PROGRAM, **variables: str) -> subprocess.Co
         (["/nowhere.toml", "--web"], "nowhere.toml"),
         (["--replay", "/nowhere.log", "--web"], "nowhere"),
         (["--replay", "/nowhere.log", "--save", "x.rrd"], "nowhere"),
+        (
+            ["--replay", "/nowhere.log", "--save", "x.rrd", "--seconds", "2"],
+            "--seconds: got 2.0, allowed: with --replay and --save only together with --speed",
+        ),
+        (["--replay", "/nowhere.log", "--save", "x.rrd", "--rate", "2"], "--rate: got 2.0, allowed: with"),
         (["--simulate", "--speed", "2", "--web"], "--speed: got 2.0, allowed: only with --replay"),
         (["--simulate", "--channel", "can1", "--web"], "--channel: got 'can1', allowed: only without"),
         (["--simulate", "--port", "9000"], "--port: got 9000, allowed: only with --web"),
@@ -58,6 +63,21 @@ def test_what_cannot_run_is_one_line(arguments: list[str], said: str, tmp_path: 
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
     assert not Path("x.rrd").exists()
+
+
+def test_a_hand_that_cannot_run_leaves_no_file(tmp_path: Path, sdk: None) -> None:
+    """The next attempt would be refused because of it."""
+    hand, saved = tmp_path / "hand.toml", tmp_path / "hand.rrd"
+    hand.write_text(
+        '[[buses]]\nname = "can0"\nchannel = "no_such_bus"\n'
+        '[[patches]]\nname = "p0"\nnode_id = 5\ntolerances = "exact"\n'
+        "layout = { upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4 }\n"
+    )
+    for _ in range(2):
+        done = run(str(hand), "--save", str(saved))
+        assert (done.returncode, done.stdout) == (2, "")
+        assert "no_such_bus" in done.stderr
+        assert not saved.exists()
 
 
 def test_a_port_in_use_is_one_line(sdk: None) -> None:

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from skinnode.config import HandConfig
+from skinnode.config.patches import ElectrodesConfig, LayoutConfig
 from skinnode.errors import SkinError
 from skinnode.host import Host, Subscription
+from skinnode.model.layout import PatchLayout
+from skinnode.monitor.field_map import aspect_of
 from skinnode.monitor.live_source import HostSource
 from skinnode.process import clock
+from skinnode.record import Recorder
+from skinnode.view.conversion import Conversion
 from skinnode.view.drawing_thread import STATE_S, DrawingThread
 from skinnode.view.tick import Tick
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 from vcan_sim.virtual_time import VirtualClock
 
-from .conftest import a_hand
+from .conftest import SMALL, a_hand
 
 
 @pytest.fixture(autouse=True)
@@ -147,3 +154,40 @@ def test_a_drawing_that_fails_ends_alone() -> None:
         assert all(host.health(name).condition == "operational" for name in ("p0", "p1"))
     assert isinstance(thread.failure, SkinError)
     assert "no space left on device" in str(thread.failure)
+
+
+def test_a_patch_that_supplies_its_electrodes_is_drawn_with_them(tmp_path: Path) -> None:
+    """Twice as wide as planned; live, by the drawing of a recording, and by its replay."""
+    plan = a_hand(patches=1, solver={"method": "exact"})
+    planned = plan.patches[0].layout.build()
+    wide = PatchLayout(
+        planned.upper_m * [2.0, 1.0, 1.0], planned.lower_m * [2.0, 1.0, 1.0], planned.resistivity_ohm_per_m
+    )
+    supplied = with_layout(plan, LayoutConfig(**SMALL, coordinates="node"))
+    ticks: list[Tick] = []
+    path = tmp_path / "run.log"
+    with (
+        Fleet(with_layout(plan, LayoutConfig(electrodes=ElectrodesConfig.of(wide)))),
+        Recorder(supplied, path) as recorder,
+        Host.from_config(supplied, tap=recorder) as host,
+        HostSource(host) as source,
+        DrawingThread(source, ticks.append),
+    ):
+        clock.sleep(1.0)
+    converted: list[Tick] = []
+    Conversion(path).run(converted.append)
+    for drawn_ticks in (ticks, converted):
+        given = [rest_m for tick in drawn_ticks for rest_m in tick.supplied_m.values()]
+        np.testing.assert_allclose(given[-1], wide.upper_m, rtol=0, atol=1e-8)
+        assert len(given) <= 2  # as planned until the node has supplied its own
+        first = next(tick for tick in drawn_ticks if tick.fields)
+        before = drawn_ticks[: drawn_ticks.index(first) + 1]
+        assert any("p0" in tick.supplied_m and tick.supplied_m["p0"] is given[-1] for tick in before)
+        surface = next(tick.view for tick in reversed(drawn_ticks) if tick.view).patch("p0").surface
+        assert surface is not None
+        assert surface.aspect == pytest.approx(2.0 * aspect_of(planned.upper_m), rel=1e-5)
+
+
+def with_layout(hand: HandConfig, layout: LayoutConfig) -> HandConfig:
+    patches = tuple(patch.model_copy(update={"layout": layout}) for patch in hand.patches)
+    return hand.model_copy(update={"patches": patches})

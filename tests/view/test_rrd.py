@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.config.links import PoseConfig
 from skinnode.errors import ConfigError
-from skinnode.host import Host
+from skinnode.host import Host, health_watch
 from skinnode.model.frames import FieldFrame
 from skinnode.monitor.live_source import HostSource
+from skinnode.monitor.replay_source import ReplaySource
 from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.view.conversion import Conversion
@@ -131,6 +134,44 @@ def test_a_live_hand_in_a_file(tmp_path: Path, sdk: None) -> None:
     assert 0.0 < max(loads) < 100.0
 
 
+def test_forces_and_positions_are_those_of_the_hand_file_if_patches_are_drawn_side_by_side(
+    tmp_path: Path, sdk: None
+) -> None:
+    from skinnode.view.drawing import HandDrawing
+    from skinnode.view.outputs import Target
+    from skinnode.view.stream import open_stream
+
+    turned, path = PoseConfig(position_m=(0.0, 0.0, 0.1), rpy_rad=(np.pi, 0.0, 0.0)), tmp_path / "hand.rrd"
+    hand = a_hand()
+    patches = tuple(patch.model_copy(update={"pose": turned}) for patch in hand.patches)
+    hand = hand.model_copy(update={"patches": patches})
+    with (
+        VirtualClock(),
+        open_stream(Target(None, path, "hand")) as stream,
+        Fleet(hand),
+        Host.from_config(hand) as host,
+        HostSource(host) as source,
+    ):
+        drawing = HandDrawing(stream, hand, exaggeration=1.0, wall_minus_mono_ns=0, live=True)
+        assert drawing.placement.side_by_side
+        with DrawingThread(source, drawing.draw):
+            clock.sleep(1.0)
+    found: dict[str, list[list[float]]] = defaultdict(list)
+    for row in Rows(path).in_time("/contacts"):
+        for line in row["TextDocument:text"].as_py()[0].splitlines():
+            cells = [cell.strip() for cell in line.split("|")]
+            if line.startswith("| p"):
+                found[cells[1].partition(",")[0]].append(
+                    [float(x) for x in cells[4].split(" ± ")[0].split(",")]
+                )
+    assert set(found) == {"p0", "p1"}
+    for places_mm in found.values():  # a patch of 4 × 4 electrodes, 4 mm apart and 2 mm high, upside down
+        x, y, z = np.array(places_mm).T
+        assert -4.0 < x.min() <= x.max() < 16.0
+        assert -16.0 < y.min() <= y.max() < 4.0
+        assert z == pytest.approx(98.0, abs=0.11)
+
+
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """Two seconds of a hand of which one patch is lost."""
@@ -145,6 +186,19 @@ def recording(tmp_path: Path) -> Path:
         fleet.inject(Faults(unplugged=True), "p1")
         clock.sleep(1.0)
     return path
+
+
+def changes_in(fields: list[FieldFrame]) -> list[tuple[int, str, str]]:
+    """Time, patch and kind of each onset and release of a touch in a list of fields."""
+    touched: dict[str, bool] = {}
+    found = []
+    for field in fields:
+        assert field.stamp is not None
+        if field.touched is not None and field.touched != touched.get(field.stamp.patch, False):
+            touched[field.stamp.patch] = field.touched
+            what = "touched" if field.touched else "released"
+            found.append((field.stamp.t_sync_ns, field.stamp.patch, what))
+    return found
 
 
 def test_a_conversion_draws_every_field_in_the_time_of_the_recording(recording: Path) -> None:
@@ -165,11 +219,31 @@ def test_a_conversion_draws_every_field_in_the_time_of_the_recording(recording: 
     assert [event.subject for event in lost] == ["p1"]
     last_ns = max(stamp.t_receive_ns for stamp in stamps if stamp and stamp.patch == "p1")
     assert 0 < lost[0].t_ns - last_ns < 1_000_000_000
+    touches = [
+        (event.t_ns, event.subject, event.what)
+        for tick in ticks
+        for event in tick.events
+        if event.what in ("touched", "released")
+    ]
+    assert touches == changes_in(expected) != []
     states = [tick.t_ns for tick in ticks if tick.view is not None]
     gaps = np.diff(states[1:-1])
     assert len(gaps) > 5
     assert (gaps >= 2.5e8).all()
     assert (gaps < 3.3e8).all()  # with the check every 50 ms and a SYNC every 25 ms
+
+
+def test_the_events_of_a_replay_are_complete_when_it_is_over(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However fast it is: here, it is over before the health is checked for the first time."""
+    monkeypatch.setattr(health_watch, "_CHECK_S", 60.0)
+    with ReplaySource(replay(recording)) as source:
+        while not source.over:
+            time.sleep(0.01)
+        events = source.events()
+    touches = [(e.t_ns, e.subject, e.what) for e in events if e.what in ("touched", "released")]
+    assert touches == changes_in(list(replay(recording))) != []
 
 
 def view(*arguments: str) -> subprocess.CompletedProcess[str]:

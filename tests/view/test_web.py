@@ -21,6 +21,7 @@ import pytest
 
 from skinnode.errors import ConfigError, SkinError
 from skinnode.view import viewer_process
+from skinnode.view.outputs import OutputOptions, open_output
 from skinnode.view.viewer_process import LOCAL, ViewerProcess, free_port, require_display, require_free
 from skinnode.view.web_page import WebPage
 
@@ -31,6 +32,29 @@ PAGE = b"""<html><head>
   href="https://fonts.example/css2?family=Inter"
   rel="stylesheet"
 /></head><script src="re_viewer.js"></script><script src="https://elsewhere.example/x.js"></script></html>"""
+
+_PROGRAM = """\
+#!{python}
+import http.server, socket, sys, threading, time
+
+given = dict(zip(sys.argv[1::1], sys.argv[2::1]))
+address = given["--bind"]
+
+class Server(http.server.ThreadingHTTPServer):
+    address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write({page})
+
+data = Server((address, int(given["--port"])), Handler)
+threading.Thread(target=data.serve_forever, daemon=True).start()
+time.sleep(0.3)  # the SDK's program, too, opens this port later
+Server((address, int(given["--web-viewer-port"])), Handler).serve_forever()
+"""
+"""Program in the place of the SDK's."""
 
 
 @pytest.fixture
@@ -113,6 +137,29 @@ def test_a_browser_that_leaves_disturbs_nobody(files: int, capfd: pytest.Capture
                 gone.sendall(b"GET /re_viewer_bg.wasm HTTP/1.1\r\n\r\n")
         assert get(port, "/?url=x")[0] == 200
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("address", "in_url"), [("127.0.0.2", "127.0.0.2"), ("::1", "[::1]")])
+def test_a_page_on_one_address_of_this_computer_has_its_files_from_there(
+    address: str, in_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The SDK's program listens only on the given address; so does the program in its place."""
+    program = tmp_path / "rerun"
+    program.write_text(_PROGRAM.format(python=sys.executable, page=PAGE))
+    program.chmod(0o700)
+    monkeypatch.setattr(viewer_process, "_program", lambda: program)
+    port = free_port()
+    options = OutputOptions(window=False, web=True, save=None, address=address, port=port)
+    with open_output(options) as output:
+        assert output.page_url == f"http://{in_url}:{port}/"
+        assert output.target("hand").url == f"rerun+http://{in_url}:{port + 1}/proxy"
+        connection = http.client.HTTPConnection(address, port, timeout=20.0)
+        connection.request("GET", "/?url=x")
+        answer = connection.getresponse()
+        assert answer.status == 200
+        assert b'src="re_viewer.js"' in answer.read()
+        assert f"http://{in_url}:{port + 1}" in answer.headers["Content-Security-Policy"]
+        connection.close()
 
 
 def test_a_port_in_use_and_a_foreign_address_are_told() -> None:

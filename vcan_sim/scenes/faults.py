@@ -9,12 +9,15 @@ from typing import Any, Final
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
+from skinnode.protocol.profile import PatchProfile
 from vcan_sim.bus_attacker import NO_BUS_FAULTS, check_bus
 from vcan_sim.fault_schedule import FaultSchedule, TimedFault
 from vcan_sim.fault_text import parse_values
-from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
+from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_places
 from vcan_sim.scenes.tables import FaultConfig, SceneConfig
 
+PatchSize = tuple[tuple[int, int], int]
+"""Numbers of upper and lower wires of a patch, and number of chunks in its scans."""
 _WIRE: Final = re.compile(r"(?P<patch>.+) (?P<side>upper|lower) (?P<number>\d{1,4})")
 """Format of a wire name in the ``where`` key, such as ``palm upper 3``."""
 
@@ -38,15 +41,15 @@ def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
         except ConfigError as error:
             raise _with_place(scene, i, error) from None
     schedule = FaultSchedule(tuple(found), scene.repeat_s)
-    shapes: dict[str, tuple[int, int]] = {}
+    sizes: dict[str, PatchSize] = {}
     for late in found:
         _check_alone(scene, late, found[: late.number])
         try:
-            _check_together(schedule, late, late.from_s, hand, shapes)
+            _check_together(schedule, late, late.from_s, hand, sizes)
         except ConfigError as error:
             raise _with_place(scene, late.number, error) from None
     for early in found:
-        _check_end(scene, schedule, early, hand, shapes)
+        _check_end(scene, schedule, early, hand, sizes)
     return schedule
 
 
@@ -94,7 +97,7 @@ def _check_together(
     fault: TimedFault,
     t_s: float,
     hand: HandConfig,
-    shapes: dict[str, tuple[int, int]],
+    sizes: dict[str, PatchSize],
 ) -> None:
     """Raise ConfigError if the faults active at ``t_s`` at the place of ``fault`` contradict each other."""
     values: dict[str, Any] = {}
@@ -105,9 +108,11 @@ def _check_together(
         check_bus(dataclasses.replace(NO_BUS_FAULTS, **values), hand.bus(fault.place))
         return
     faults = dataclasses.replace(NO_FAULTS, **values)
-    if fault.place not in shapes:
-        shapes[fault.place] = next(p for p in hand.patches if p.name == fault.place).layout.build().shape
-    check_wires(faults, fault.place, shapes[fault.place])
+    if fault.place not in sizes:
+        patch = next(p for p in hand.patches if p.name == fault.place)
+        profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
+        sizes[fault.place] = ((profile.rows, profile.columns), profile.n_chunks)
+    check_places(faults, fault.place, *sizes[fault.place])
 
 
 def _check_end(
@@ -115,13 +120,13 @@ def _check_end(
     schedule: FaultSchedule,
     early: TimedFault,
     hand: HandConfig,
-    shapes: dict[str, tuple[int, int]],
+    sizes: dict[str, PatchSize],
 ) -> None:
     """Raise ConfigError if the faults that remain when ``early`` ends are invalid without it."""
     if early.to_s == math.inf:
         return
     try:
-        _check_together(schedule, early, early.to_s, hand, shapes)
+        _check_together(schedule, early, early.to_s, hand, sizes)
     except ConfigError as error:
         key = f"faults[{early.number}].to_s"
         allowed = f"a time at which the remaining faults are valid; {error.key} needs {error.allowed}"

@@ -182,7 +182,7 @@ class TouchConfig(Table):
     from_s: _Time
     """Scene time of the first contact, in s."""
     to_s: _Time
-    """Scene time of the last contact, in s."""
+    """Scene time of the last contact, in s; at least two time steps after ``from_s``."""
     ramp_s: _Duration = 0.3
     """Duration of the initial press and of the final lift, in s. Both follow minimum-jerk profiles."""
     depth_m: Length | None = None
@@ -378,6 +378,10 @@ class SceneConfig(Table):
             end_s = touch.each[-1].to_s
             if self.repeat_s is not None and end_s > self.repeat_s:
                 raise ConfigError(f"touches[{i}].to_s", touch.to_s, f"at most repeat_s, {self.repeat_s} s")
+            least_s = touch.from_s + 2.0 * self.step_s
+            if touch.to_s < least_s - 1e-9:  # there might be no time step during the touch
+                allowed = f"at least {least_s:g} s, two time steps (step_s) after from_s"
+                raise ConfigError(f"touches[{i}].to_s", touch.to_s, allowed)
             self._check_motions(i, touch)
             for j, other in enumerate(self.touches[:i]):
                 if other.body == touch.body and _meet(touch, other):

@@ -85,7 +85,7 @@ class PhysicalPatch:
             including placement errors. The displacement that solvers estimate is this array minus
             :attr:`rest_m`. At rest, without position errors, the result is ``layout.upper_m`` itself.
         """
-        if not self.imperfections.row_time_s:
+        if not self._row_s[-1]:  # without a row time, or with a single upper wire
             return self._upper_m(t_s, upper_m_at)
         spans = max(1, math.ceil(self._row_s[-1] / ROW_STEP_S))
         knots = np.linspace(0.0, self._row_s[-1], spans + 1)

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 
-from skinnode.config import MAX_BUS_LOAD
 from skinnode.diagnose.facts import BusFacts, Finding, Sure
 from skinnode.text.words import counted
 
@@ -62,11 +61,11 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             f"{bus.error_frames} in {bus.seconds:.1f} s",
             "check the termination, the stub lengths, and each node's bit rate and power supply",
         )
-    if bus.load > MAX_BUS_LOAD:
+    if bus.load > bus.max_load:
         yield found(
             "the bus load exceeds the planning limit",
             Sure.CERTAIN,
-            f"{bus.load:.0%} in the busiest second; at most {MAX_BUS_LOAD:.0%} is allowed",
+            f"{bus.load:.0%} in the busiest second; at most {bus.max_load:.0%} is allowed",
             "increase sync.period_ms, set the send mode to changed, or put fewer patches on this bus",
         )
     if bus.outages:

@@ -63,7 +63,9 @@ class PatchApplication:
         self._emcy = services.emcy
         unknown = np.full((profile.rows, profile.columns), acquisition.scale.open, dtype=np.uint32)
         first_chunk = pack_scan(unknown, 0, profile)[0]
-        self.stream = ScanStream(services.store, services.tpdos, first_chunk, pacing.catch_up_ns)
+        self.stream = ScanStream(
+            services.store, services.tpdos, first_chunk, pacing.catch_up_ns, acquisition.selection.forget
+        )
         """Sender of the scans."""
         self._storage = services.storage
         self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
@@ -114,11 +116,15 @@ class PatchApplication:
                 self._tare(t_ns)
                 self._storage.keep_baseline()
 
-    def reset(self) -> None:
-        """Restart the scan counter. Persistent faults are reported again."""
+    def reset(self, *, everything: bool) -> None:
+        """Restart the scan counter. Persistent faults are reported again.
+
+        If ``everything`` is true, forget the result of the self-test, too.
+        """
         self._counter, self._late = -1, False
         self._wire_faults.reset()
-        self._test = SELF_TEST_NEVER_RUN
+        if everything:
+            self._test = SELF_TEST_NEVER_RUN
         self.source.reset(self._now())
 
     def enter(self, *, operational: bool) -> None:
@@ -187,6 +193,7 @@ class PatchApplication:
         """Take a scan and queue it, or skip it if another scan is already waiting."""
         self._counter = counter
         if self.stream.full:
+            self._acquisition.selection.forget()  # receivers notice the gap
             self.overruns += 1
             held_up = self.stream.is_held_up(t_ns)
             self.slow_overruns += held_up

@@ -22,16 +22,21 @@ unsent when the window closes. Event-driven TPDOs are not affected.
 **Queue.** While a scan is being sent, one other scan can wait. Chunks of two scans are never interleaved. If
 the node leaves OPERATIONAL, all scans are dropped without a summary. If the chunk TPDO is disabled,
 the summary states that chunks are missing.
+
+**Lost frames.** If a chunk or a summary cannot be sent, receivers no longer know the codes of unsent chunks,
+so the next scan must be a full scan. This does not apply to chunks that are discarded at the end of the
+synchronous window: in a full scan, there would be more of them.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.errors import BusError
 from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
@@ -68,10 +73,18 @@ class ScanStream:
         tpdos: TPDO engine of the node.
         chunk: Initial contents of the chunk record (0x2010).
         catch_up_ns: Maximum delay, in ns, that the stream makes up by sending later chunks sooner.
+        on_lost: Callback for a scan of which a chunk or the summary could not be sent.
     """
 
-    def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
-        self._tpdos, self._catch_up_ns = tpdos, catch_up_ns
+    def __init__(
+        self,
+        store: ObjectStore,
+        tpdos: TpdoEngine,
+        chunk: bytes,
+        catch_up_ns: int,
+        on_lost: Callable[[], None],
+    ) -> None:
+        self._tpdos, self._catch_up_ns, self._on_lost = tpdos, catch_up_ns, on_lost
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
@@ -79,6 +92,7 @@ class ScanStream:
         self._unsent: deque[bytes] = deque()
         self._verbatim = False  # whether the carrier's mapping is exactly the chunk record
         self._chunks_sent = 0
+        self._cut_off = False  # whether the synchronous window has closed before the last chunk
         self._busy_ns = 0  # time at which the stream last started sending after being idle
         self._just_begun = False
         self._paced_ns = 0  # sum of all inhibit times since _busy_ns
@@ -171,12 +185,15 @@ class ScanStream:
             following, self._next_scan = self._next_scan, None
             try:
                 self._end(ended, t_ns)
+            except BusError:
+                self._on_lost()
+                raise
             finally:  # start the next scan even if the summary cannot be sent
                 if following is not None:
                     self._begin(following, t_ns)
 
     def _begin(self, scan: OutgoingScan, t_ns: int) -> None:
-        self._scan, self._carrier, self._chunks_sent = scan, None, 0
+        self._scan, self._carrier, self._chunks_sent, self._cut_off = scan, None, 0, False
         for tpdo in self._tpdos.owned(od.CHUNK):
             if tpdo.parameters.event_driven or tpdo.number in scan.turns:
                 self._carrier = tpdo
@@ -199,6 +216,7 @@ class ScanStream:
         while unsent and carrier.ready_ns <= t_ns:
             if carrier.parameters.synchronous and not tpdos.window.lets_out(carrier.number, t_ns):
                 unsent.clear()
+                self._cut_off = True
                 break
             self.chunk = unsent.popleft()
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
@@ -208,7 +226,11 @@ class ScanStream:
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:
-        flags = scan.flags if self._chunks_sent == len(scan.chunks) else scan.flags | SummaryFlag.OVERRUN
+        flags = scan.flags
+        if self._chunks_sent != len(scan.chunks):
+            flags |= SummaryFlag.OVERRUN
+            if not self._cut_off:
+                self._on_lost()
         said = scan.counter, flags, self._chunks_sent, scan.device_time_us
         payload = (
             pack_summary(*said)

@@ -11,13 +11,13 @@ received for the first time in OPERATIONAL.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import Refused
 from skinnode.canopen.data_length import fd_length
 from skinnode.canopen.emergency import EmcyCode
+from skinnode.errors import BusError
 from skinnode.node.pacing import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import PdoRecords
 from skinnode.node.rejected import Rejected
@@ -173,10 +173,21 @@ class RpdoEngine:
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
-        """Write the mapped objects. Refused values are ignored, because a PDO has no response."""
+        """Write the mapped objects. Refused values are ignored, because a PDO has no response.
+
+        An object may cause a frame that the bus refuses, such as the first chunk of a single scan. The other
+        objects are written nevertheless; then the error is raised.
+        """
+        failure: BusError | None = None
         for index, subindex, start, end in rpdo.fields:
-            with contextlib.suppress(Refused):
+            try:
                 self._store.write(index, subindex, data[start:end])
+            except Refused:
+                continue
+            except BusError as error:
+                failure = error
+        if failure is not None:
+            raise failure
 
     # --- errors
 

@@ -44,7 +44,7 @@ class Tpdo:
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
-        self.ready_ns = 0
+        self.ready_ns = -NO_DEADLINE_NS
         """Time (ns) at which the inhibit time ends."""
         self.timer_ns = NO_DEADLINE_NS
         """Time (ns) at which the event timer elapses."""
@@ -74,6 +74,7 @@ class Tpdo:
         """Apply the parameters in the object dictionary."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
+        self.ready_ns += new.inhibit_ns - old.inhibit_ns  # counted from the last transmission
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
             self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         if (old.enabled, old.kind, old.event_timer_ns) != (new.enabled, new.kind, new.event_timer_ns):

@@ -135,7 +135,8 @@ SKN_API bool skn_find_wire_faults(const skn_code_t *codes, skn_wire_faults_t *fa
 SKN_API void skn_sender_init(skn_sender_t *sender);
 
 /* Make the next scan a full scan. Call this function after a write to the send policy, on entry to OPERATIONAL,
- * and after a converter failure. */
+ * after a converter failure, and after a scan that was skipped or not sent completely: receivers then no longer know
+ * the codes of unsent chunks. */
 SKN_API void skn_sender_full(skn_sender_t *sender);
 
 /* Announce a new baseline in the next summary, and make the next scan a full scan. */
@@ -225,7 +226,8 @@ typedef struct {
     uint32_t bad_counter; /* * scan counter outside the range of the SYNC counter */
     uint32_t bad_form;    /* * summaries without a check, although the node sends checks */
     uint32_t resyncs;     /* number of times that the scan counter continued out of sequence after a pause */
-    uint32_t baseline_doubts; /* discarded scans that may have announced a new baseline: read R0 again */
+    uint32_t baseline_doubts; /* discarded scans that may have announced a new baseline. Read R0 again after one of
+                                 these, and after missed scans, lost summaries and resyncs */
 } skn_stats_t;
 
 /* Assembler of the scans of one node. Read `stats`; use the functions for everything else. */

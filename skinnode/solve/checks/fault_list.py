@@ -25,7 +25,10 @@ WITHIN: Final = 10
 """Number of successive frames in which the detections of a fault are counted."""
 ADMIT: Final = 64
 """Number of consecutive frames in which the readings of a confirmed fault must agree with the field before
-they are used again. The number doubles each time the fault returns. Not tuned."""
+they are used again. The number doubles each time the fault returns, up to :data:`MOST_ADMIT`. Not tuned."""
+MOST_ADMIT: Final = 4096
+"""Maximum of this number. Without it, the readings of a loose contact would not be used again for hours after
+the repair."""
 AGREE: Final = 3.0
 """Maximum RMS deviation of readings that agree with a field, in standard deviations."""
 
@@ -96,7 +99,7 @@ class FaultList:
             deviations = math.sqrt(2.0 * max(group.gain, 0.0))
             fault = DataFault(group.part, group.kind, *key, scan, deviations)
             if len(self._seen[key]) >= FRAMES:
-                needed = self._needed[key] = 2 * self._needed.get(key, ADMIT // 2)
+                needed = self._needed[key] = min(2 * self._needed.get(key, ADMIT // 2), MOST_ADMIT)
                 self._named[key] = _Named(fault, group.mask(self._shape), needed=needed)
             elif group.kind is not FaultKind.CROSSED:
                 passing.append(fault)

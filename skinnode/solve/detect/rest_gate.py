@@ -25,6 +25,11 @@ from skinnode.solve.wires.problem import PatchProblem
 
 NOISIER: Final = 1.25
 """Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
+NOISIER_FRAMES: Final = 4
+"""Number of successive frames with more noise than the detector assumes after which it adopts their noise.
+Until then, their readings have less weight. The detector adopts less noise immediately. If it also adopted
+more noise immediately, it would discard its last frames at each change, and a touch would never end if the
+noise alternates."""
 GAP_S: Final = 2.0
 """Interval between two frames, in s, above which the detector counts the missing frames. Over a shorter
 interval, the drift is negligible."""
@@ -53,6 +58,7 @@ class RestGate:
             with np.errstate(divide="ignore", invalid="ignore"):
                 relative = codes.rounding_ohm / codes.baseline_ohm
             rounding = np.where(np.isfinite(relative), relative, 0.0)
+        self._rounding = rounding
         self._drift, self._gates = options.drift, options.hold and not options.estimate_noise
         self.detector = TouchDetector(
             layout,
@@ -66,11 +72,13 @@ class RestGate:
         self._factor, self._period_s = 1.0, options.scan_period_s
         self.t_ns: int | None = None
         self._usual, self._layout = noise, layout
+        self._noisier_frames = 0  # number of successive frames with more noise than the detector assumes
         self._stated = self._usual_level = float(np.median(noise))
         self.reset()
 
     def reset(self) -> None:
         """Discard the state of the stream."""
+        self._noisier_frames = 0
         self._restore()
         self.detector.reset()
         self._verdict = TouchVerdict(None, 0.0, False)
@@ -99,11 +107,13 @@ class RestGate:
         self._count_missing()
         if left_out is not None:
             valid = ~left_out if valid is None else valid & ~left_out
-        if noise is None:
-            self._restore()
-        else:
+        if noise is not None:
             self._adapt(noise)
             noise = self._factor * noise
+        elif self._is_noisier(self._usual_level):
+            noise = np.hypot(self._factor * self._usual, self._rounding)
+        else:
+            self._restore()
         self._noise = noise
         self._verdict = self.detector.see(ohm, valid, noise)
         field = self._field
@@ -189,10 +199,21 @@ class RestGate:
         if not usable.size:
             return
         now = float(np.median(usable))
-        if not 1.0 / NOISIER < now / self._stated < NOISIER:
+        if not self._is_noisier(now) and not 1.0 / NOISIER < now / self._stated < NOISIER:
             self._stated = now
             self.detector.set_noise(self._factor, np.full(self._layout.shape, now))
             self._field = None
+
+    def _is_noisier(self, now: float) -> bool:
+        """Return whether the detector must wait before it adopts the noise ``now`` of a frame."""
+        if not now / self._stated >= NOISIER:
+            self._noisier_frames = 0
+            return False
+        self._noisier_frames += 1
+        if self._noisier_frames < NOISIER_FRAMES:
+            return True
+        self._noisier_frames = 0
+        return False
 
 
 def _gain_std(layout: PatchLayout, options: TrackerOptions) -> Float | None:

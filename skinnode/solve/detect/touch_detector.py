@@ -241,18 +241,22 @@ class TouchDetector:
             valid: (U, K) bool: False for readings to ignore; None to use all readings.
             noise: (U, K) relative noise of this frame, including quantization; None for the usual noise.
         """
-        its = self._arrays
+        its, expected = self._arrays, None
         its.ohm[:] = ohm
         weight = self._weight
         if noise is not None:
             usable = self._known & (noise > 0.0) & (noise < math.inf)
-            weight = np.where(usable, 1.0 / np.maximum(noise, self._sigma), 0.0)
+            own = np.where(usable, np.maximum(noise, self._sigma), math.inf)
+            weight, expected = 1.0 / own, its.expected.copy()
+            its.expected *= self._sigma / own  # in units of the noise of this frame
         if valid is not None:
             weight = np.where(valid, weight, 0.0)
         its.weight[:] = weight
         before, self._at = (self._at, self._frames), (self._at + 1) % KEPT
         self._frames = min(self._frames + 1, KEPT)
         self._compute(self._noise * (1.0 + self._slow.offset_share))
+        if expected is not None:
+            its.expected[:] = expected
         found = its.found.tolist()
         if found[COUNT] < ENOUGH * its.ohm.size:
             self._at, self._frames = before[0], min(before[1], KEPT - 1)  # the oldest frame is overwritten

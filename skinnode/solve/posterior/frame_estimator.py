@@ -227,8 +227,9 @@ class FrameEstimator:
         except TimeoutError:
             known = self._known
             status, held = self._give_up(Status.DEADLINE)
+            field = self._field(self._observe(readings), status, held, start)
             self._known = known  # the trusted field is still a valid start for the next frame
-            observation = self._observe(readings)
+            return field
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:

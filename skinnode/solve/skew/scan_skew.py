@@ -124,7 +124,8 @@ class ScanSkew:
         scan, scans = ContactScan(now_ns, field.contacts), self._contacts
         self._last = new if last is None else last.replaced(new, new.known)
         self._before = last if before is None or last is None else before.replaced(last, new.known)
-        self._contacts = (scan, *scans[:1])
+        if new.known.any():  # otherwise, the field says nothing about contacts
+            self._contacts = (scan, *scans[:1])
         if last is None or not (new.known.any() and new.moved_m.any()) or _is_still(new, last, before):
             return field
         field = _interpolated(field, new, last, last if before is None else before, self._late_ns)

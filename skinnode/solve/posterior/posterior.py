@@ -1,7 +1,7 @@
 """Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
 
-On request, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame with those of earlier
-frames. ``frame_estimator`` then solves the frame, and :mod:`skinnode.solve.checks.data_check` tests whether
+If the noise is 1e-4 or more, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame
+with those of earlier frames. ``frame_estimator`` then solves the frame, and :mod:`skinnode.solve.checks.data_check` tests whether
 the readings of the frame itself contradict each other. If some readings are wrong, the frame is solved again
 without them.
 """
@@ -103,7 +103,7 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        With the ``past`` option, the estimate also uses the readings of earlier frames.
+        Unless the ``past`` option is off, the estimate also uses the readings of earlier frames.
 
         No resistance value raises an exception. If a wire has no usable resistances, its displacement is
         estimated from its neighbours, and its standard deviation is larger. If no deformation explains the

@@ -62,8 +62,8 @@ class EstimateOptions:
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
             the loads are not local, ``discs`` falls back to ``cells``.
         past: ``auto`` if the posterior is to use earlier frames as well when the noise of the readings is
-            1e-4 or more; ``off`` if it is to solve each frame alone. A sudden change in the loads takes effect
-            in the same frame. Ignored if ``estimate_noise`` is set, and for patches with fewer than 12
+            1e-4 or more; ``off`` if it is to solve each frame alone. A sudden change in the loads takes
+            effect in the same frame. Ignored if ``estimate_noise`` is set, and for patches with fewer than 12
             readings.
 
     Raises:

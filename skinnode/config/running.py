@@ -36,7 +36,7 @@ class SolverConfig(Table):
     drift: Annotated[Drift, one_of(Drift)] = "none"
     """Estimate the drift of the resistances together with the displacement: as one gain for the whole
     ``patch``, or one gain for each upper ``wire``. Requires the method ``posterior``."""
-    past: Annotated[Past, one_of(Past)] = "off"
+    past: Annotated[Past, one_of(Past)] = "auto"
     """Use earlier scans: with ``auto``, the method ``posterior`` combines each scan with earlier scans if the
     noise is 1e-4 or more; with ``off``, every scan is solved on its own."""
     normal_only: bool = False

@@ -61,9 +61,10 @@ class EstimateOptions:
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
             the loads are not local, ``discs`` falls back to ``cells``.
-        past: Whether the posterior also uses earlier frames: ``off``, or ``auto`` if the noise of the
-            readings is 1e-4 or more. A sudden change in the loads takes effect in the same frame. Ignored if
-            ``estimate_noise`` is set.
+        past: ``auto`` if the posterior is to use earlier frames as well when the noise of the readings is
+            1e-4 or more; ``off`` if it is to solve each frame alone. A sudden change in the loads takes
+            effect in the same frame. Ignored if ``estimate_noise`` is set, and for patches with fewer than 12
+            readings.
 
     Raises:
         ValueError: If an option is out of range.
@@ -84,7 +85,7 @@ class EstimateOptions:
     hold: bool = True
     deadline_us: float | None = None
     prior: str = "cells"
-    past: str = "off"
+    past: str = "auto"
 
     def __post_init__(self) -> None:
         if self.drift not in DRIFTS:

@@ -12,8 +12,8 @@ The tracker estimates the noise of the stream and corrects the stated noise
 (:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker changes the method when the estimated noise
 crosses the limit for ``exact``. The new method starts at the rest position.
 
-On request, the posterior also uses the readings of earlier frames (:mod:`skinnode.solve.posterior.past`), but
-no readings from before an untouched frame or a gap in the stream.
+If the noise is 1e-4 or more, the posterior also uses the readings of earlier frames
+(:mod:`skinnode.solve.posterior.past`), but no readings from before an untouched frame or a gap in the stream.
 
 If the upper wires are sampled one after the other, the field of a moving skin is moved to the time of the
 first wire at the end (:mod:`skinnode.solve.skew`). All solvers and tests work on the fields as solved.

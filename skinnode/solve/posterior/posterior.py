@@ -1,9 +1,9 @@
 """Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
 
-On request, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame with those of earlier
-frames. ``frame_estimator`` then solves the frame, and :mod:`skinnode.solve.checks.data_check` tests whether
-the readings of the frame itself contradict each other. If some readings are wrong, the frame is solved again
-without them.
+If the noise is 1e-4 or more, :mod:`skinnode.solve.posterior.past` first combines the readings of a frame
+with those of earlier frames. ``frame_estimator`` then solves the frame, and
+:mod:`skinnode.solve.checks.data_check` tests whether the readings of the frame itself contradict each other.
+If some readings are wrong, the frame is solved again without them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skinnode.solve.checks.linearised_readings import Solved
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 from skinnode.solve.posterior.observation import Readings
-from skinnode.solve.posterior.past.frame_filter import FrameFilter
+from skinnode.solve.posterior.past.frame_filter import LEAST_READINGS, FrameFilter
 
 PLACED: Final = 2.0
 """Assumed error of a reading per pitch of placement error, as a fraction of the largest change in any
@@ -76,7 +76,8 @@ class Posterior(FrameEstimator):
         self._past: FrameFilter | None = None
         self._factor = 1.0  # noise factor of the frames in the filter
         self._solved_share = 1.0  # noise in the last solve, relative to the noise of its frame alone
-        if self.options.past == "auto" and not self.options.estimate_noise:
+        enough = layout.shape[0] * layout.shape[1] >= LEAST_READINGS
+        if self.options.past == "auto" and enough and not self.options.estimate_noise:
             self._past = FrameFilter(layout, self._problem.a_rest)
         self.warm_up()
 
@@ -103,7 +104,7 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        With the ``past`` option, the estimate also uses the readings of earlier frames.
+        Unless the ``past`` option is off, the estimate also uses the readings of earlier frames.
 
         No resistance value raises an exception. If a wire has no usable resistances, its displacement is
         estimated from its neighbours, and its standard deviation is larger. If no deformation explains the

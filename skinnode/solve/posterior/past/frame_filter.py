@@ -36,6 +36,10 @@ LEAST_NOISE: Final = 2.5e-5
 covers would make correct readings contradict each other."""
 MOST_FRAMES: Final = 64.0
 """Maximum number of frames averaged."""
+LEAST_READINGS: Final = 12
+"""Minimum number of readings of a patch. With fewer, the noise estimate
+(:mod:`skinnode.solve.noise_estimate`) cannot distinguish movements from noise: with 6 readings and a new
+press in each frame, it was 3,000 times too large; with 12, it was right."""
 ENOUGH: Final = 0.5
 """Minimum fraction of usable readings. With fewer, the filter forgets all earlier frames."""
 JUMPED: Final = 0.5

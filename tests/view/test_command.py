@@ -69,7 +69,7 @@ def test_a_hand_that_cannot_run_leaves_no_file(tmp_path: Path, sdk: None) -> Non
     """The next attempt would be refused because of it."""
     hand, saved = tmp_path / "hand.toml", tmp_path / "hand.rrd"
     hand.write_text(
-        '[[buses]]\nname = "can0"\nchannel = "no_such_bus"\n'
+        '[[buses]]\nname = "can0"\ninterface = "socketcan"\nchannel = "no_such_bus"\n'
         '[[patches]]\nname = "p0"\nnode_id = 5\ntolerances = "exact"\n'
         "layout = { upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4 }\n"
     )

@@ -155,7 +155,7 @@ def test_forces_and_positions_are_those_of_the_hand_file_if_patches_are_drawn_si
         drawing = HandDrawing(stream, hand, exaggeration=1.0, wall_minus_mono_ns=0, live=True)
         assert drawing.placement.side_by_side
         with DrawingThread(source, drawing.draw):
-            clock.sleep(1.0)
+            clock.sleep(4.0)
     found: dict[str, list[list[float]]] = defaultdict(list)
     for row in Rows(path).in_time("/contacts"):
         for line in row["TextDocument:text"].as_py()[0].splitlines():

@@ -271,10 +271,10 @@ def test_a_patch_that_cannot_be_brought_up_says_why() -> None:
         error_register=0,
     )
     why = "node 5: no answer to 0x1018"
-    for condition, told in ((Condition.BOOTING, "booting"), (Condition.STALE, "starting")):
+    for condition, word in ((Condition.BOOTING, "booting"), (Condition.STALE, "starting")):
         health = dataclasses.replace(sound, condition=condition)
-        assert judge_patch(health, []) == (told, "note", ())
-        assert judge_patch(dataclasses.replace(health, complaint=why), []) == (told, "note", (why,))
+        assert judge_patch(health, []) == (word, "note", ())
+        assert judge_patch(dataclasses.replace(health, complaint=why), []) == (word, "note", (why,))
     refused = dataclasses.replace(sound, condition=Condition.REFUSED, complaint=why, refusal=why)
     assert judge_patch(refused, []) == ("refused", "bad", (why,))
 

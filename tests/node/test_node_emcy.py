@@ -306,7 +306,7 @@ def test_emergency_that_the_bus_refuses_is_told_later(operational) -> None:
     desk = operational
     desk.bus_refuses = True
     desk.node.on_frame(0x80, b"", desk.t_ns)
-    with pytest.raises(BusError):  # whoever drives it hears of it
+    with pytest.raises(BusError):  # the caller learns of it
         desk.run(0)
     desk.bus_refuses = False
     desk.run(0)

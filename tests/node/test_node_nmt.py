@@ -26,7 +26,7 @@ def test_boot_up_that_the_bus_refuses_is_told_as_soon_as_it_does_not(desk, reset
     desk.bus_refuses = True
     desk.node.on_frame(0, bytes.fromhex(reset), desk.t_ns)
     assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
-    with pytest.raises(BusError):  # whoever drives it hears of it
+    with pytest.raises(BusError):  # the caller learns of it
         desk.run(0)
     desk.bus_refuses = False
     desk.run(500)

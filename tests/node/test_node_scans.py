@@ -555,7 +555,7 @@ class TestCommandPdo:
     def test_a_scan_that_the_bus_refuses_does_not_cost_the_mode(self, desk) -> None:
         desk.start()
         desk.bus_refuses = True
-        with pytest.raises(BusError):  # whoever drives it hears of it
+        with pytest.raises(BusError):  # the caller learns of it
             desk.node.on_frame(0x204, bytes.fromhex("00 00 00 00 01 01"), desk.t_ns)
         desk.bus_refuses = False
         assert desk.read(0x2020, 1) == 1

@@ -9,8 +9,9 @@ from skinnode.remote import keys
 if TYPE_CHECKING:
     import zenoh
 
-_ANSWER_S: Final = 1.0
-"""Time limit for replies from daemons and routers, in s."""
+_ANSWER_S: Final = 5.0
+"""Time limit for replies from daemons and routers, in s. It is reached only on an overloaded machine or over
+a connection that has just failed."""
 
 
 def tokens(session: zenoh.Session, hand: str | None = None) -> list[str]:

@@ -39,7 +39,11 @@ _QUEUED: Final = 16
 """Number of batches (64 KiB each) queued per connection; Zenoh's maximum. Zenoh's default, 2, is too small
 for the fields of 16 patches that are solved at the same time."""
 _SETTLE_S: Final = 1.0
-"""Time limit for connecting to the other daemons and to the router at startup, in s."""
+"""Time limit for connecting to the router at startup, in s."""
+_SETTLE_LOCAL_S: Final = 5.0
+"""Time limit for connecting to the other daemons on this machine at startup, in s. It is reached only if the
+machine is overloaded, or if a port belongs to another kind of program. A daemon that did not connect could
+not see that another daemon already publishes its hand."""
 _ROUTER_MS: Final = 500
 """Time limit for one attempt by a program to connect to a router, in ms."""
 _PAUSE_S: Final = 0.1
@@ -129,7 +133,7 @@ def require_protected(options: SessionOptions, *, commands: bool) -> None:
 
 
 def open_daemon(options: SessionOptions) -> zenoh.Session:
-    """Open a daemon's session and wait up to a second for connections to the other daemons.
+    """Open a daemon's session and wait for connections to the other daemons and to the router.
 
     Raises:
         ConfigError: if the configuration is invalid, all ports are in use, or ``options.listen`` cannot be
@@ -236,9 +240,9 @@ def _settle(session: zenoh.Session, options: SessionOptions, own: int) -> None:
     """Wait until the session is connected to the other daemons and to the router."""
     ports = range(options.port, options.port + PORTS)
     others = sum(_accepts(port) for port in ports if port != own)
-    end_s = clock.monotonic() + _SETTLE_S
-    while clock.monotonic() < end_s:
-        routed = options.router is None or session.info.routers_zid()
+    begin_s = clock.monotonic()
+    while (waited_s := clock.monotonic() - begin_s) < _SETTLE_LOCAL_S:
+        routed = options.router is None or waited_s >= _SETTLE_S or session.info.routers_zid()
         if routed and len(session.info.peers_zid()) >= others:
             return
         clock.sleep(_POLL_S)

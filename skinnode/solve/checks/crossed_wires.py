@@ -47,8 +47,8 @@ def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
     return z, present
 
 
-def likeliest(
-    p: Float, alpha: Float, z: Float, present: Mask, *, far: bool = False
+def likeliest(  # noqa: PLR0913 - the frame, and which pairs to test
+    p: Float, alpha: Float, z: Float, present: Mask, *, far: bool = False, enough: float = -math.inf
 ) -> tuple[float, WirePair]:
     """Return the largest gain in log evidence (nats) from exchanging two wires, and these wires.
 
@@ -59,38 +59,51 @@ def likeliest(
         present: (U, K) mask of the available readings. Two readings are exchanged only if both are available.
         far: Whether to test all pairs of wires rather than only neighbours. Testing all pairs takes ten times
             as long.
+        enough: Gain that must be exceeded; if no exchange does, it is returned in place of the largest gain,
+            with an arbitrary pair.
     """
     upper_wires, lower_wires = z.shape
     longest = max(upper_wires, lower_wires)
     gain, upper, one, other = best_exchange(
         p, alpha, z.ravel(), present.ravel(), upper_wires, lower_wires, longest - 1 if far else 1,
-        np.empty(longest),
+        enough, np.empty(longest),
     )  # fmt: skip
     return gain, WirePair(FaultyPart.UPPER if upper else FaultyPart.LOWER, int(one), int(other))
 
 
 @njit
 def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
-    p: Float, alpha: Float, z: Float, present: Mask, upper: int, lower: int, reach: int, delta: Float
+    p: Float,
+    alpha: Float,
+    z: Float,
+    present: Mask,
+    upper: int,
+    lower: int,
+    reach: int,
+    enough: float,
+    delta: Float,
 ) -> tuple[float, bool, int, int]:
     """Return the gain (nats), the layer and the wire numbers of the best exchange of two wires.
 
     The layer is True for upper wires. Only wires whose numbers differ by at most ``reach`` are tested. The
-    gain is reduced by ln n, because the best of n pairs is chosen. ``delta`` (max(U, K),) is a work array.
+    gain is reduced by ln n, because the best of n pairs is chosen. If it does not exceed ``enough``,
+    ``enough`` is returned. ``delta`` (max(U, K),) is a work array.
     """
-    best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
+    pairs = 0
+    for apart in range(1, reach + 1):
+        pairs += max(upper - apart, 0) + max(lower - apart, 0)
+    choice = math.log(max(pairs, 1))
+    best, is_upper, one, other = enough + choice, True, 0, 0
     for apart in range(1, reach + 1):
         for u in range(upper - apart):
-            pairs += 1
             gain = _gain(p, alpha, z, present, u * lower, apart * lower, 1, lower, best, delta)
             if gain > best:
                 best, one, other, is_upper = gain, u, u + apart, True
         for k in range(lower - apart):
-            pairs += 1
             gain = _gain(p, alpha, z, present, k, apart, lower, upper, best, delta)
             if gain > best:
                 best, one, other, is_upper = gain, k, k + apart, False
-    return best - math.log(max(pairs, 1)), is_upper, one, other
+    return best - choice, is_upper, one, other
 
 
 @njit_part

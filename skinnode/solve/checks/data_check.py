@@ -269,8 +269,9 @@ class DataCheck:
         if field.held is not None and field.held.all() and not self._doubted:
             return True
         moved = field.displacement_m.reshape(self._shape[0], -1)
-        self._readings.set_complete(moved, float(solved.noise.mean()))
-        return self._needs_no_explanation(self._readings.gains()) and not self._unusual_change(solved)
+        sigma = float(solved.noise.mean())
+        self._readings.set_complete(moved, sigma)
+        return self._needs_no_explanation(self._readings.gains()) and not self._unusual_change(solved, sigma)
 
     @property
     def _doubted(self) -> bool:
@@ -287,15 +288,15 @@ class DataCheck:
             and bool(solved.used.all())
         )
 
-    def _unusual_change(self, solved: Solved) -> Gains | None:
+    def _unusual_change(self, solved: Solved, sigma: float) -> Gains | None:
         """Return the gains from assuming a wrong reading if the change since the last field is suspicious.
 
-        The linearised readings then describe the change.
+        The linearised readings then describe the change. ``sigma`` is the mean relative noise of the frame.
         """
         change = self._last_field.change(solved.field, self._frame)
         if change is None:
             return None
-        self._readings.set_complete(change, math.sqrt(2.0) * float(solved.noise.mean()))
+        self._readings.set_complete(change, math.sqrt(2.0) * sigma)
         gain, suspect = self._readings.reading_gain()
         if gain < SUSPICIOUS_CHANGE or self._excused_change.covers(self._frame, gain, suspect):
             return None
@@ -329,7 +330,7 @@ class DataCheck:
         Crossed wires are not reported, because they would have been found in the changes since rest; the
         frame is then doubtful.
         """
-        gains = self._unusual_change(solved)
+        gains = self._unusual_change(solved, float(solved.noise.mean()))
         if gains is None or not self._may_examine(gains, until):
             return ()
         found = self._explain(self._readings.noisier())

@@ -244,7 +244,7 @@ class Explainer:
     def _by_loads(self, z: Float, present: Mask, cost: float, extra: Callable[[Level], float]) -> float:
         """Return the highest log evidence for loads alone, with ``extra`` added at each κ."""
         model = self._model
-        evidence, scratch = np.empty(len(model.kappa)), np.empty(z.size)
+        evidence, scratch = np.empty(len(model.kappa)), np.empty((2, z.size))
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
         return max(
             float(evidence[number])

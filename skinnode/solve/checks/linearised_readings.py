@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinnode.compiled.jit import njit
 from skinnode.model.frames import FieldFrame
 from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
@@ -22,7 +23,8 @@ from skinnode.solve.checks.crossed_wires import likeliest
 from skinnode.solve.checks.greedy_search import crossing_gain
 from skinnode.solve.checks.reading_model import ReadingModel, changes, evidences
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, least_fitting
-from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
+from skinnode.solve.linalg.cholesky import multiply, multiply_vector, solve_positive
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.wires.problem import PatchProblem
 
 WRONG: Final = 0.1
@@ -93,7 +95,9 @@ class LinearisedReadings:
         self.model = ReadingModel.of(problem.layout)
         shape = problem.layout.shape
         self.z, self._f = np.empty(shape), np.empty(shape)
-        self._c, self._alpha = np.empty((2, self.z.size))
+        self._c = np.empty((2, self.z.size))
+        self._numbers = np.empty(len(OFFSETS), np.int64)
+        self._weights, self._alpha = np.empty((2, len(OFFSETS), self.z.size))
         self._row = np.empty(max(shape))
         self.evidence, self._of_noise = np.empty((2, len(self.model.kappa)))
         self._all = np.ones(shape, bool)
@@ -107,6 +111,7 @@ class LinearisedReadings:
         self.set_complete(at_rest, 1.0)
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
         self.gains()
+        self.reading_gain()
         self.present = np.ones(shape, bool)
         self.present[0, 0] = False
         self._fit()
@@ -167,25 +172,15 @@ class LinearisedReadings:
 
     def gains(self) -> Gains:
         """Return the largest gains in log evidence from assuming a fault."""
-        readings, wires, suspect, z = -math.inf, -math.inf, -1, self.z.ravel()
-        for offset in OFFSETS:
-            number = self.best - offset
-            if number < 0:
-                break
-            gain, where = self._reading_gain(number)
-            gain += float(self.evidence[number] - self.evidence[self.best])
-            if gain > readings:
-                readings, suspect = gain, where
-            if not offset:
-                level = self.model.level(number)
-                readings = max(readings, likeliest(level.precision, self._alpha, self.z, self.present)[0])
-                found = least_fitting(level.wires, z, self._alpha, self.present, self.sigma, self._row)
-                wires = found.gain
-        return Gains(readings, wires, suspect)
+        reading, suspect = self._reading_gain(len(OFFSETS))
+        level, alpha = self.model.level(self.best), self._alpha[0]
+        crossed, _ = likeliest(level.precision, alpha, self.z, self.present, enough=reading)
+        found = least_fitting(level.wires, self.z.ravel(), alpha, self.present, self.sigma, self._row)
+        return Gains(crossed, found.gain, suspect)
 
     def reading_gain(self) -> tuple[float, int]:
         """Return the largest gain from assuming one wrong reading at the best κ, and the reading's index."""
-        return self._reading_gain(self.best)
+        return self._reading_gain(1)
 
     def noisier(self) -> float:
         """Return the log evidence of the frame, assuming that its noise is above the stated level.
@@ -193,13 +188,10 @@ class LinearisedReadings:
         If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
         ln(ratio) for each reading.
         """
-        model, z = self.model, self.z.ravel()
+        model, z, scratch = self.model, self.z.ravel(), np.empty_like(self._c)
         most = -math.inf
         for ratio in NOISE_RATIOS:
-            np.divide(z, ratio, out=self._alpha)
-            best = evidences(
-                model.vectors_t, model.shrink, model.log_det, self._alpha, self._c, self._of_noise
-            )
+            best = evidences(model.vectors_t, model.shrink, model.log_det, z / ratio, scratch, self._of_noise)
             most = max(most, float(self._of_noise[best]) - z.size * math.log(ratio))
         return most - math.log(len(NOISE_RATIOS))
 
@@ -218,10 +210,13 @@ class LinearisedReadings:
         known = np.isfinite(deviation) & (solved.noise > 0)
         return np.where(known, deviation, np.inf), known
 
-    def _reading_gain(self, number: int) -> tuple[float, int]:
-        level = self.model.level(number)
-        multiply_vector(level.precision, self.z.ravel(), self._alpha)
-        gain, where = crossing_gain(level.diagonal, self._alpha, self.present.ravel(), self.cost)
+    def _reading_gain(self, count: int) -> tuple[float, int]:
+        """Return the largest gain from one wrong reading at the first ``count`` :data:`OFFSETS`."""
+        model = self.model
+        gain, where = _largest_gain(
+            model.vectors_t, model.shrink, model.diagonals, self.evidence, self._c[0], self.present.ravel(),
+            self.best, self.cost, self._numbers[:count], self._weights, self._alpha,
+        )  # fmt: skip
         return gain, int(where)
 
     def _remove_gain(self, std: float) -> None:
@@ -233,8 +228,9 @@ class LinearisedReadings:
         upper, lower = self.z.shape
         self._fit()
         p = self.model.level(self.best).precision
-        multiply_vector(p, self.z.ravel(), self._alpha)
-        sums = self._alpha.reshape(upper, lower).sum(axis=1)
+        alpha = np.empty(self.z.size)
+        multiply_vector(p, self.z.ravel(), alpha)
+        sums = alpha.reshape(upper, lower).sum(axis=1)
         blocks = p.reshape(upper, lower, upper, lower).sum(axis=(1, 3))
         if self._drift == "wire":
             self.z -= np.linalg.solve(blocks + np.eye(upper) / std**2, sums)[:, None]
@@ -261,3 +257,43 @@ class LinearisedReadings:
             if solve_positive(block, unknown, count):
                 z[missing] = -unknown
                 self.best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self.evidence)
+
+
+@njit
+def _largest_gain(  # noqa: PLR0913 - a kernel: arrays by name
+    vectors_t: Float,
+    shrink: Float,
+    diagonals: Float,
+    evidence: Float,
+    c: Float,
+    present: Mask,
+    best: int,
+    cost: float,
+    numbers: Index,
+    weights: Float,
+    alpha: Float,
+) -> tuple[float, int]:
+    """Return the largest gain from one wrong reading over several κ, and the reading's index.
+
+    The gain is relative to the log evidence at the best κ. Writes the indices of the κ into ``numbers`` (n,)
+    and α = P z at each κ into the rows of ``alpha`` (≥ n, m). With the eigenvectors V and the components
+    ``c`` (m,) of z along them, α = V diag(shrink) c, so that one matrix serves every κ. ``weights`` (≥ n, m)
+    is a work array.
+    """
+    used = 0
+    for k in range(len(numbers)):
+        offset = OFFSETS[k]
+        if best >= offset:
+            numbers[used] = best - offset
+            for i in range(c.size):
+                weights[used, i] = shrink[best - offset, i] * c[i]
+            used += 1
+    multiply(weights[:used], vectors_t, alpha[:used])
+    gain, where = -math.inf, -1
+    for j in range(used):
+        number = numbers[j]
+        here, reading = crossing_gain(diagonals[number], alpha[j], present, cost)
+        here += evidence[number] - evidence[best]
+        if here > gain:
+            gain, where = here, reading
+    return gain, where

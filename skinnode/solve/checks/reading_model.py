@@ -80,6 +80,7 @@ class ReadingModel:
         kappa: (L,) values of κ.
         log_det: (L,) ln det S at each κ.
         shrink: (L, m) 1 / (1 + κ² λ) for the eigenvalues λ of J C Jᵀ.
+        diagonals: (L, m) diagonal of the precision P at each κ.
         vectors_t: (m, m) eigenvectors of J C Jᵀ, as rows.
     """
 
@@ -105,6 +106,8 @@ class ReadingModel:
         spread = self.kappa[:, None] ** 2 * values
         self.shrink = 1.0 / (1.0 + spread)
         self.log_det = np.log1p(spread).sum(axis=1)
+        self.diagonals = np.empty_like(self.shrink)
+        multiply(self.shrink, self.vectors_t**2, self.diagonals)
         self._levels: dict[int, Level] = {}
         self._loads: dict[int, LoadTables] = {}
         m, loads = self.response.shape
@@ -147,7 +150,7 @@ class ReadingModel:
         moved, gram = np.empty((m, loads)), np.empty((0, 0))
         multiply(precision, self.response, moved)
         stiffness = np.einsum("mj,mj->j", self.response, moved)
-        diagonal = np.concatenate([precision.diagonal(), stiffness])
+        diagonal = np.concatenate([self.diagonals[number], stiffness])
         if not self._stores:
             return LoadTables(diagonal, gram, gram)
         gram = np.empty((loads, loads))
@@ -172,7 +175,7 @@ class ReadingModel:
         multiply(vectors, weighted, precision)
         return Level(
             precision=precision,
-            diagonal=precision.diagonal().copy(),
+            diagonal=self.diagonals[number],
             wires=WireTables.of(precision, covariance, self.shape),
         )
 
@@ -197,17 +200,17 @@ def evidences(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> int:
     """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the maximum.
 
-    The constant −½ m ln 2π is omitted. ``c`` (m,) is a work array.
+    The constant −½ m ln 2π is omitted. Writes the components of ``z`` along the eigenvectors, and their
+    squares, into ``c`` (2, m).
     """
-    multiply_vector(vectors_t, z, c)
-    for i in range(c.size):
-        c[i] *= c[i]
+    parts, squares = c[0], c[1]
+    multiply_vector(vectors_t, z, parts)
+    for i in range(parts.size):
+        squares[i] = parts[i] * parts[i]
+    multiply_vector(shrink, squares, out)
     best = 0
     for j in range(out.size):
-        row, square = shrink[j], 0.0
-        for i in range(c.size):
-            square += c[i] * row[i]
-        out[j] = -0.5 * (square + log_det[j])
+        out[j] = -0.5 * (out[j] + log_det[j])
         if out[j] > out[best]:
             best = j
     return best

@@ -2,5 +2,5 @@
 
 ``tracker`` runs the stages of a solve. ``stream`` contains the arrays of a stream and the acceptance test for
 roots. ``recover_lost_wires`` retries wires that failed. ``fixed_coordinates`` reduces the number of unknowns.
-``contacts`` estimates loads and contacts from a solved field.
+``load_fit`` estimates the loads that explain a solved field, and ``contacts`` finds its contacts.
 """

@@ -1,15 +1,16 @@
-"""Householder QR factorisation of a small tall matrix, for wires with more equations than unknowns.
+"""QR factorisation of small matrices: Householder reflectors, and Gram-Schmidt orthonormalisation.
 
-The normal equations would square the condition number (Golub & Van Loan, Matrix Computations, 4th ed.,
-sections 5.2 and 5.3).
+Householder factors solve wires with more equations than unknowns. The normal equations would square the
+condition number (Golub & Van Loan, Matrix Computations, 4th ed., sections 5.2 and 5.3).
 """
 
 from __future__ import annotations
 
 import math
 
-from skinnode.compiled.jit import njit_part
+from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
+from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.linalg.vectors import dot
 
 
@@ -107,3 +108,23 @@ def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float)
         scale = 1.0 / diagonal[j]
         for i in range(m):
             row[i] *= scale
+
+
+@njit
+def orthonormalise(rows: Float, work: Float) -> None:
+    """Orthonormalise linearly independent ``rows`` (r, n) by classical Gram-Schmidt with two passes.
+
+    The second pass makes the rows orthogonal to machine precision (Giraud et al., 2005). ``work`` (r,) is a
+    work array.
+    """
+    for i in range(len(rows)):
+        row, overlap = rows[i], work[:i]
+        for _ in range(2):
+            multiply_vector(rows[:i], row, overlap)
+            for j in range(i):
+                factor, other = overlap[j], rows[j]
+                for k in range(row.size):
+                    row[k] -= factor * other[k]
+        length = math.sqrt(dot(row, row))
+        for k in range(row.size):
+            row[k] /= length

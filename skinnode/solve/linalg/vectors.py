@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.compiled.jit import njit, njit_part
+from skinnode.compiled.jit import njit_part
 from skinnode.compiled.simd import LANES
 from skinnode.model.layout import Float
 
@@ -46,21 +44,3 @@ def largest(a: Float) -> float:
         if not size <= top:
             top = size
     return top
-
-
-@njit
-def orthonormalise(rows: Float) -> None:
-    """Orthonormalise linearly independent ``rows`` (r, n) by modified Gram-Schmidt with two passes.
-
-    The second pass makes the rows orthogonal to machine precision (Giraud et al., 2005).
-    """
-    for i in range(len(rows)):
-        row = rows[i]
-        for _ in range(2):
-            for j in range(i):
-                overlap = dot(rows[j], row)
-                for k in range(row.size):
-                    row[k] -= overlap * rows[j, k]
-        length = math.sqrt(dot(row, row))
-        for k in range(row.size):
-            row[k] /= length

@@ -96,8 +96,7 @@ def _variance(  # noqa: PLR0913 - a kernel: loads and their posterior by name
         row, value = rows[i], 0.0
         for c in range(count):
             value += signs[c] * share[cells[c]] * row[3 * cells[c] + 2]
-        value *= weight[i]
-        seen += value * value
+        seen += weight[i] * value * value
     return max(scale2 * (own - scale2 * seen), 1e-300)
 
 
@@ -121,12 +120,12 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
         for d in range(count):
             s[c, d] = 0.0
     for i in range(rows.shape[0]):
-        row, w = rows[i], scale2 * weight[i]
+        row, w = rows[i], weight[i]
         for c in range(count):
-            b[c] = w * share[cells[c]] * row[3 * cells[c] + 2]
+            b[c] = scale2 * share[cells[c]] * row[3 * cells[c] + 2]
         for c in range(count):
             for d in range(c + 1):
-                s[c, d] -= b[c] * b[d]
+                s[c, d] -= w * b[c] * b[d]
     for c in range(count):
         s[c, c] = max(s[c, c] + scale2 * share[cells[c]], 1e-9 * scale2 * share[cells[c]])
     chi2 = 0.0
@@ -371,8 +370,8 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
     Args:
         press: (Q,) pressing loads.
         depth: (Q,) depth of the skin at the electrode of each cell, in standard deviations.
-        rows: (m, 3Q) rows of L⁻¹ J G before multiplication by ``weight``.
-        weight: (m,) factor of each row.
+        rows: (m, 3Q) rows of the information about the loads.
+        weight: (m,) weight of each row (:class:`skinnode.solve.posterior.contacts.LoadEstimate`).
         share: (Q,) prior variances of the loads, relative to ``scale2``.
         scale2: Squared scale s² of the prior, in pitch².
         own: (Q,) bool: True for a cell with an electrode.

@@ -46,14 +46,14 @@ patch would reach 4.8 standard deviations."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadEstimate:
-    """Loads estimated from a frame, with covariance s² (D − s² D Wᵀ W D), where W = diag(weight) · rows."""
+    """Loads estimated from a frame, with covariance s² (D − s² D Rᵀ diag(``weight``) R D), R = ``rows``."""
 
     mean: Float
     """(Q, 3) mean loads, in units of the prior's loads."""
     rows: Float
-    """(m, 3Q) rows of W before multiplication by ``weight``."""
+    """(m, 3Q) rows of the information about the loads."""
     weight: Float
-    """(m,) factor of each row."""
+    """(m,) weight of each row; negative for rows that remove the information of coordinates left out."""
     share: Float
     """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float
@@ -312,7 +312,6 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
             v4 += slope[4] * normal
             v5 += shared * row[first]
             v6 += shared * row[first + 1]
-        w *= w
         s0 += w * v0 * v0
         s1 += w * v1 * v1
         s2 += w * v2 * v2

@@ -80,7 +80,7 @@ class GreedySearch:
         return _search(
             z.ravel(), present.ravel().copy(), upper, lower, cost, loads, faults,
             LEAST * float(tables.diagonal[m:].max()),
-            level.precision, tables.moved, tables.gram, self._model.response_t,
+            level.precision, tables.moved_t, tables.gram, self._model.response_t,
             weighted, diagonal, vectors, share, of_upper, of_lower, block, right,
             self.kinds, self.numbers, self.gains,
         )  # fmt: skip
@@ -163,24 +163,31 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
-    item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
+    item: int, first: int, p: Float, moved_t: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 4Q,), from the tables ``moved`` and ``gram`` if available."""
+    """Write row ``item`` of E into ``row`` (m + 4Q,), from ``moved_t`` and ``gram`` if available.
+
+    If ``first`` is m, only the elements of the loads are valid.
+    """
     m = len(p)
     if item < m:
         for j in range(m):
             row[j] = p[item, j]
-    elif gram.size:
-        for i in range(m):
-            row[i] = moved[i, item - m]
-    else:
+    elif not gram.size:
         multiply_vector(p, response_t[item - m], row[:m])
+    elif first < m:
+        by_reading = moved_t[item - m]
+        for i in range(m):
+            row[i] = by_reading[i]
     if not gram.size:
         multiply_vector(response_t, row[:m], row[m:])
-        return
-    by_load = moved[item] if item < m else gram[item - m]
-    for j in range(by_load.size):
-        row[m + j] = by_load[j]
+    elif item < m:
+        for j in range(len(moved_t)):
+            row[m + j] = moved_t[j, item]
+    else:
+        by_load = gram[item - m]
+        for j in range(by_load.size):
+            row[m + j] = by_load[j]
 
 
 @njit
@@ -189,7 +196,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
     count: int,
     first: int,
     p: Float,
-    moved: Float,
+    moved_t: Float,
     gram: Float,
     response_t: Float,
     weighted: Float,
@@ -204,7 +211,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
     ``first`` are not updated.
     """
     row = vectors[count]
-    _gram_row(item, p, moved, gram, response_t, row)
+    _gram_row(item, first, p, moved_t, gram, response_t, row)
     size = row.size
     for i in range(count):
         earlier = vectors[i]
@@ -280,7 +287,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     faults: bool,
     least: float,
     p: Float,
-    moved: Float,
+    moved_t: Float,
     gram: Float,
     response_t: Float,
     weighted: Float,
@@ -302,7 +309,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     count = 0
     for i in range(m):
         if not present[i]:
-            _update(i, count, 0, p, moved, gram, response_t, weighted, diagonal, vectors, share)
+            _update(i, count, 0, p, moved_t, gram, response_t, weighted, diagonal, vectors, share)
             count += 1
     if faults:
         _copy_blocks(p, of_upper, of_lower)
@@ -327,7 +334,9 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
             first = (
                 0 if faults else m
             )  # the first m elements, for the readings, are needed only to find faults
-            _update(m + number, count, first, p, moved, gram, response_t, weighted, diagonal, vectors, share)
+            _update(
+                m + number, count, first, p, moved_t, gram, response_t, weighted, diagonal, vectors, share
+            )
             if faults:
                 _update_blocks(share[count], vectors[count], of_upper, of_lower)
             count += 1
@@ -340,7 +349,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
             )
             if chosen and present[i]:
                 present[i] = False
-                _update(i, count, 0, p, moved, gram, response_t, weighted, diagonal, vectors, share)
+                _update(i, count, 0, p, moved_t, gram, response_t, weighted, diagonal, vectors, share)
                 _update_blocks(share[count], vectors[count], of_upper, of_lower)
                 count += 1
     return total

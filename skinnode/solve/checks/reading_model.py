@@ -59,8 +59,9 @@ class LoadTables:
 
     diagonal: Float
     """(m + 4Q,) diagonal of P, followed by the diagonal of Bᵀ P B."""
-    moved: Float
-    """(m, 4Q) P B. ``moved`` and ``gram`` are empty if the tables are too large to store (:data:`STORED`)."""
+    moved_t: Float
+    """(4Q, m) Bᵀ P. ``moved_t`` and ``gram`` are empty if the tables are too large to store
+    (:data:`STORED`)."""
     gram: Float
     """(4Q, 4Q) Bᵀ P B."""
 
@@ -155,7 +156,7 @@ class ReadingModel:
             return LoadTables(diagonal, gram, gram)
         gram = np.empty((loads, loads))
         multiply(self.response_t, moved, gram)
-        return LoadTables(diagonal, moved, gram)
+        return LoadTables(diagonal, np.ascontiguousarray(moved.T), gram)
 
     def _compute(self, number: int) -> Level:
         upper, lower = self.shape

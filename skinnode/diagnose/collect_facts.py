@@ -38,8 +38,8 @@ LONGEST_S: Final = 15.0
 """Maximum duration of the capture in s, unless :data:`LEAST_PERIODS` SYNC periods take longer."""
 
 LEAST_PERIODS: Final = 1.5
-"""Minimum duration of the capture in SYNC periods. The first scan may have begun before the capture and is not
-used; with this duration, the capture contains the second scan."""
+"""Minimum duration of the capture in SYNC periods. The first scan may have begun before the capture and is
+not used; with this duration, the capture contains the second scan."""
 
 DEFAULT_NOISE: Final = 3e-6
 """Relative converter noise assumed if there is no hand file."""

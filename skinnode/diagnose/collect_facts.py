@@ -6,8 +6,6 @@ A running hand is not disturbed: nodes are started and SYNC is sent only if ``ac
 from __future__ import annotations
 
 import functools
-import json
-import subprocess
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -30,6 +28,7 @@ from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
+from skinnode.transport.socketcan import read_link
 
 SCANS: Final = 50
 """Number of scans to capture; with 50 scans, the error in the estimated noise is about 10 %."""
@@ -311,17 +310,5 @@ def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
     """Return a SocketCAN interface's controller state and bit rate, reported by ``ip``; None if unknown."""
     if bus.interface != "socketcan":
         return None, None
-    try:
-        done = subprocess.run(
-            ["ip", "-details", "-json", "link", "show", "dev", bus.channel],
-            capture_output=True,
-            text=True,
-            timeout=2,
-            check=True,
-        )
-        (link,) = json.loads(done.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError):
-        return None, None
-    data = link.get("linkinfo", {}).get("info_data", {})
-    bitrate = data.get("bittiming", {}).get("bitrate")
-    return data.get("state"), bitrate if isinstance(bitrate, int) else None
+    link = read_link(bus.channel)
+    return link.state, link.bitrate_bps

@@ -194,29 +194,38 @@ class VirtualClock:
         """
         turn = self._running
         turn.woken, turn.waiting = False, waiting
-        begun_ns = self._now_ns
+        begun_ns, waits = self._now_ns, turn.waits
         due_ns = None if seconds is None else begun_ns + max(0, round(seconds * 1e9))
         try:
             waiting.append(turn)
             if due_ns is not None:
-                heapq.heappush(self._timers, (due_ns, next(self._number), turn.waits, turn))
-            self._pass_on(turn)
+                heapq.heappush(self._timers, (due_ns, next(self._number), waits, turn))
+            self._pass_on(turn, waits)
+            if self._now_ns > begun_ns:  # also if no other thread had a turn meanwhile
+                self._readings = 0
+            return turn.woken
         except BaseException:
             self._stop_waiting(turn)
             if turn.woken:  # wake another thread instead
                 self.wake(waiting)
             raise
-        if self._now_ns > begun_ns:  # also if no other thread had a turn meanwhile
-            self._readings = 0
-        return turn.woken
 
     def wake(self, waiting: deque[_Turn]) -> None:
         """Make the longest-waiting thread in ``waiting`` ready to run."""
         if waiting:
-            turn = waiting.popleft()
-            turn.woken = True
-            turn.waits += 1
+            waiting[0].woken = True
+            self._make_ready(waiting[0])
+
+    def _make_ready(self, turn: _Turn) -> None:
+        """End the wait of a thread.
+
+        If a signal handler raises an exception between two steps, the thread is ready, and the next call or
+        :meth:`_take_turn` does the rest.
+        """
+        if turn not in self._ready:
             self._ready.append(turn)
+        turn.waits += 1
+        turn.waiting.remove(turn)
 
     def begin(self, turn: _Turn) -> None:
         """Make a new thread ready to run."""
@@ -226,17 +235,36 @@ class VirtualClock:
     def end(self, turn: _Turn) -> None:
         """Remove a thread that has ended, and let the next thread run."""
         del self._alive[turn]
-        self._run(self._next())
+        self._running = self._next()
+        self._running.open_gate()
 
-    def _pass_on(self, turn: _Turn) -> None:
+    def await_first_turn(self, turn: _Turn) -> None:
+        """Block a new thread until its first turn."""
+        self._block(turn, None, turn.waits)
+        self._readings = 0
+        self._take_turn(turn)
+
+    def _pass_on(self, turn: _Turn, waits: int) -> None:
+        """Let the next thread run, and return on the current thread's next turn.
+
+        Args:
+            turn: The current thread.
+            waits: Value of ``turn.waits`` at the beginning of the wait.
+        """
         following = self._next()
         if following is not turn:
-            waits = turn.waits
-            self._run(following)
-            self._await_turn(turn, waits)
+            self._block(turn, following, waits)
+            self._readings = 0
+        self._take_turn(turn)
         if turn is self._first and turn.error is not None:
             error, turn.error = turn.error, None
             raise error
+
+    def _take_turn(self, turn: _Turn) -> None:
+        self._ready.popleft()
+        if turn in turn.waiting:  # an exception interrupted _make_ready
+            turn.waiting.remove(turn)
+            turn.waits += 1
 
     def _stop_waiting(self, turn: _Turn) -> None:
         """End the wait of a thread that still has the turn, because a signal handler raised an exception."""
@@ -246,39 +274,42 @@ class VirtualClock:
         if turn in self._ready:
             self._ready.remove(turn)
 
-    def _await_turn(self, turn: _Turn, waits: int) -> None:
-        """Block the current thread until its turn.
+    def _block(self, turn: _Turn, following: _Turn | None, waits: int) -> None:
+        """Give ``following`` the turn, if it is not None, and block the current thread until its own turn.
 
-        Python runs signal handlers in the main thread, even while another thread has the turn. If a handler
-        raises an exception, the main thread becomes ready and raises the exception on its next turn.
+        Python runs signal handlers in the main thread, even while another thread has the turn, and between
+        any two steps of the hand-over. If a handler raises an exception before the hand-over, the exception
+        is raised immediately. After the hand-over, which is the assignment to ``_running``, the main thread
+        becomes ready and raises the exception on its next turn.
         """
         raised: BaseException | None = None
         while True:
             try:
+                if following is not None:
+                    opening, following = following, None
+                    self._running = opening
+                    opening.open_gate()
                 turn.gate.acquire()
-                break
+                if self._running is turn:
+                    break
             except BaseException as error:
                 raised = error
-                if self._running is turn:  # its turn has come, and the gate may be open or closed
-                    turn.gate = _closed_gate()
+                if self._running is turn:
                     break
                 self._interrupted.append((turn, waits))
+                self._running.open_gate()  # the exception may have prevented this
         if raised is not None:
             raise raised
 
-    def _run(self, turn: _Turn) -> None:
-        gate = turn.gate
-        self._running, self._readings = turn, 0
-        gate.release()
-
     def _next(self) -> _Turn:
-        """Return the turn of the next thread to run, advancing the clock while no thread is ready."""
+        """Return the turn of the next thread to run, advancing the clock while no thread is ready.
+
+        The turn remains in ``_ready`` until the thread takes it.
+        """
         while self._interrupted:
             turn, waits = self._interrupted.popleft()
             if turn.waits == waits:  # otherwise, the wait has already ended
-                turn.waits += 1
-                turn.waiting.remove(turn)
-                self._ready.append(turn)
+                self._make_ready(turn)
         while not self._ready:
             if not self._timers:
                 names = ", ".join(repr(turn.name) for turn in self._alive)
@@ -287,36 +318,28 @@ class VirtualClock:
                 if not self._ready:  # the first thread has left the ``with`` block
                     raise deadlock
                 break
-            due_ns, _, waits, what = heapq.heappop(self._timers)
+            due_ns, _, waits, what = self._timers[0]
             if isinstance(what, _Turn):
-                if what.waits != waits:
-                    continue  # the thread was woken before its time-out
-                what.waits += 1
-                what.waiting.remove(what)
-                self._ready.append(what)
-            self._now_ns = max(self._now_ns, due_ns)
-            if not isinstance(what, _Turn):
+                if what.waits == waits:  # otherwise, the thread was woken before its time-out
+                    self._now_ns = max(self._now_ns, due_ns)
+                    self._make_ready(what)
+                heapq.heappop(self._timers)
+            else:
+                self._now_ns = max(self._now_ns, due_ns)
+                heapq.heappop(self._timers)
                 try:
                     what()
                 except BaseException as error:
                     # Raised here, it would end whichever thread happens to be waiting, and stop the others.
                     self._raise_in_first(error)
-        return self._ready.popleft()
+        return self._ready[0]
 
     def _raise_in_first(self, error: BaseException) -> None:
         """End the first thread's wait with an exception. If it is not waiting, its next wait ends with it."""
         first = self._first
         first.error = first.error or error
         if first in first.waiting:
-            first.waits += 1
-            first.waiting.remove(first)
-            self._ready.append(first)
-
-
-def _closed_gate() -> threading.Lock:
-    gate = threading.Lock()
-    gate.acquire()
-    return gate
+            self._make_ready(first)
 
 
 class _Turn:
@@ -324,7 +347,8 @@ class _Turn:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.gate = _closed_gate()
+        self.gate = threading.Lock()
+        self.gate.acquire()
         self.woken = False
         """Whether :meth:`VirtualClock.wake` ended the last wait."""
         self.waiting: deque[_Turn] = deque()
@@ -332,6 +356,13 @@ class _Turn:
         self.waits = 0
         """Number of completed waits. Timers set for earlier waits have a smaller number and are ignored."""
         self.error: BaseException | None = None
+
+    def open_gate(self) -> None:
+        """Let the thread check whether it has the turn."""
+        try:  # noqa: SIM105 - contextlib.suppress would make each turn slower
+            self.gate.release()
+        except RuntimeError:  # already open
+            pass
 
 
 class _Event(threading.Event):
@@ -501,7 +532,7 @@ class _Thread(threading.Thread):
         self._of.sleep(0.0)  # lets the new thread run first, as a real thread usually does
 
     def run(self) -> None:
-        self._turn.gate.acquire()
+        self._of.await_first_turn(self._turn)
         try:
             with clock.use(self._of):
                 super().run()

@@ -6,8 +6,6 @@ A running hand is not disturbed: nodes are started and SYNC is sent only if ``ac
 from __future__ import annotations
 
 import functools
-import json
-import subprocess
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -30,12 +28,17 @@ from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
+from skinnode.transport.socketcan import read_link
 
 SCANS: Final = 50
 """Number of scans to capture; with 50 scans, the error in the estimated noise is about 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum duration of the capture in s, regardless of the SYNC period."""
+"""Maximum duration of the capture in s, unless :data:`LEAST_PERIODS` SYNC periods take longer."""
+
+LEAST_PERIODS: Final = 1.5
+"""Minimum duration of the capture in SYNC periods. The first scan may have begun before the capture and is
+not used; with this duration, the capture contains the second scan."""
 
 DEFAULT_NOISE: Final = 3e-6
 """Relative converter noise assumed if there is no hand file."""
@@ -214,7 +217,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
         heard = len(capture.syncs)
         connection.wait_until(lambda: len(capture.syncs) > heard, max(_FIRST_SYNC_S, 2.5 * period_s))
         ours = active and len(capture.syncs) == heard
-        due_s, end_s = time.monotonic(), time.monotonic() + min(LONGEST_S, 2 * SCANS * period_s)
+        due_s, end_s = time.monotonic(), time.monotonic() + _capture_s(period_s)
         number, load = 0, 0.0
         while min(map(capture.scans, running)) < SCANS and time.monotonic() < end_s:
             if ours:
@@ -231,6 +234,11 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
     finally:
         for node_id in start:
             connection.link.send(od.NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))
+
+
+def _capture_s(period_s: float) -> float:
+    """Return the maximum duration of the capture, in s, for a SYNC period in s."""
+    return min(max(LONGEST_S, LEAST_PERIODS * period_s), 2 * SCANS * period_s)
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
@@ -302,17 +310,5 @@ def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
     """Return a SocketCAN interface's controller state and bit rate, reported by ``ip``; None if unknown."""
     if bus.interface != "socketcan":
         return None, None
-    try:
-        done = subprocess.run(
-            ["ip", "-details", "-json", "link", "show", "dev", bus.channel],
-            capture_output=True,
-            text=True,
-            timeout=2,
-            check=True,
-        )
-        (link,) = json.loads(done.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError):
-        return None, None
-    data = link.get("linkinfo", {}).get("info_data", {})
-    bitrate = data.get("bittiming", {}).get("bitrate")
-    return data.get("state"), bitrate if isinstance(bitrate, int) else None
+    link = read_link(bus.channel)
+    return link.state, link.bitrate_bps

@@ -20,9 +20,10 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Time limit (s) from the start command to the first heartbeat that reports operational: four heartbeat
-periods.
-"""
+"""Minimum time limit (s) from the start command to the first heartbeat that reports operational."""
+
+START_HEARTBEATS: Final = 4
+"""Number of heartbeat periods that this time limit contains at least."""
 
 _PROBE_NS: Final = 250_000_000
 """Interval (ns) between requests to an absent node. The requests reveal a node that sends no heartbeats and
@@ -149,7 +150,7 @@ class NodeSupervision:
             self._begin(node, now_ns)
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
-        elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
+        elif remote.link.t_dispatched_ns > node.since_ns + start_deadline_s(remote) * 1e9:
             # the reported state predates the start command, and no heartbeat has arrived since
             silent = remote.monitor.nmt_state == NmtState.OPERATIONAL
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
@@ -248,6 +249,11 @@ class NodeSupervision:
         self._baselines.look(node, now_ns)
 
 
+def start_deadline_s(remote: RemoteNode) -> float:
+    """Return the time limit (s) from the start command to the first heartbeat that reports operational."""
+    return max(START_DEADLINE_S, START_HEARTBEATS * remote.heartbeat_s)
+
+
 def _read_back(node: Supervised) -> None:
     """Check whether a node that sends no scans has lost its configuration."""
     # a failed read is repeated later
@@ -268,6 +274,6 @@ def _not_started(remote: RemoteNode, *, silent: bool) -> str:
     """Return the message for a node that did not start in time."""
     node = f"node {remote.patch.node_id}"
     if silent:
-        return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command"
+        return f"{node}: got no heartbeat within {start_deadline_s(remote):g} s of the start command"
     state = known(remote.monitor.nmt_state)
     return f"{node}: got NMT state {state} after the start command, expected {NmtState.OPERATIONAL:d}"

@@ -11,7 +11,7 @@ from skinnode.canopen.nmt import NmtState
 from skinnode.config import BusConfig, Missing, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
 from skinnode.host import nmt_master
-from skinnode.host.node_supervision import START_DEADLINE_S
+from skinnode.host.node_supervision import start_deadline_s
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sdo_client import Abandoned
@@ -171,7 +171,8 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
     t_start_ns = clock.monotonic_ns()
     for node, solver in ready.items():
         node.start(solver, node.stream.withholdings)
-    naps = round(START_DEADLINE_S / _POLL_S)
+    deadline_s = max(map(start_deadline_s, ready), default=0.0)
+    naps = round(deadline_s / _POLL_S)
     for node in ready:
         patch, monitor = node.patch, node.monitor
         while not node.has_other_master and not monitor.said_since(NmtState.OPERATIONAL, t_start_ns):
@@ -180,7 +181,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
                     patch.node_id,
                     f"patch {patch.name!r} on {patch.bus}: got NMT state {known(monitor.nmt_state)} after "
                     f"the start command, expected {NmtState.OPERATIONAL:d} (operational) within "
-                    f"{START_DEADLINE_S:g} s",
+                    f"{deadline_s:g} s",
                 )
             naps -= 1
             if naps % _START_AGAIN_NAPS == 0:

@@ -203,9 +203,11 @@ _PACKAGE: Final = """\
   <license>MIT</license>
   <buildtool_depend>ament_cmake</buildtool_depend>
   <build_depend>lely_core_libraries</build_depend>
+  <exec_depend>ament_index_python</exec_depend>
   <exec_depend>canopen_core</exec_depend>
   <exec_depend>canopen_master_driver</exec_depend>
   <exec_depend>canopen_proxy_driver</exec_depend>
+  <exec_depend>launch</exec_depend>
   <export>
     <build_type>ament_cmake</build_type>
   </export>

@@ -81,6 +81,7 @@ class RemoteHand(RunningHand, Closing):
         self._was_away: bool | None = None
         self._run = 0
         self._refusal: SkinError | None = None
+        self._closed = False
         self._watch = DaemonWatch(session, self.hand.name)
         self._described = self._watch.arrivals
         recipients = Recipients(self._on_field, self._on_report, self._on_event, self._on_turn)
@@ -131,7 +132,8 @@ class RemoteHand(RunningHand, Closing):
             KeyError: if there is no such patch.
             ValueError: if ``deadline_s`` is negative, above 600 s or not a number.
             NodeError: if the host raises it.
-            SkinError: if the daemon does not accept commands or does not reply in time.
+            SkinError: if the daemon does not accept commands or does not reply in time, or the hand has been
+                closed.
         """
         self._command("tare", patch, tare_deadline_s(self.hand, deadline_s))
 
@@ -141,7 +143,8 @@ class RemoteHand(RunningHand, Closing):
         Raises:
             KeyError: if there is no such patch.
             NodeError: if the host raises it.
-            SkinError: if the daemon does not accept commands or does not reply in time.
+            SkinError: if the daemon does not accept commands or does not reply in time, or the hand has been
+                closed.
         """
         self._command("reset_node", patch, _RESET_S)
 
@@ -150,6 +153,8 @@ class RemoteHand(RunningHand, Closing):
     @property
     def away(self) -> str | None:
         """Reason why no data is arriving; None while the daemon is present and sending."""
+        if self._closed:
+            return f"hand {self.hand.name!r}: this program has closed the connection"
         if self._refusal is not None:
             return str(self._refusal)
         if not self._watch.present:
@@ -192,6 +197,7 @@ class RemoteHand(RunningHand, Closing):
     def close(self) -> None:
         """End all subscriptions, the thread and the session. Further calls have no effect."""
         self._receiver.close()
+        self._closed = True
         self._session.close()
         self._publisher.end()
         self._events.end()

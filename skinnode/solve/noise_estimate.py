@@ -7,6 +7,10 @@ contrasts are independent, and each has the variance of the noise:
 quadratic  (r₀ − r₁ − r₂ + r₃) / 2
 cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 
+If the stated noise differs between the frames, the variance of a contrast is the sum of the frames'
+variances, weighted with the squares of the coefficients above. The contrasts are then correlated by up to
+0.45, so the standard error of the estimate is up to 10 % larger than assumed.
+
 A block is rejected if the skin moved. Two tests detect motion:
 
 - Slow motion, a step or a lost scan makes the variances of the two contrasts unequal. Slow motion makes the
@@ -151,13 +155,16 @@ def _contrasts(
         for k in range(frames.shape[2]):
             r0, r1, r2, r3 = frames[0, u, k], frames[1, u, k], frames[2, u, k], frames[3, u, k]
             mean = 0.25 * r0 + 0.25 * r1 + 0.25 * r2 + 0.25 * r3
-            own, coded = (mean * noise[u, k]) ** 2, rounding_ohm[u, k] ** 2
+            outer = (mean * noise[0, u, k]) ** 2 + (mean * noise[3, u, k]) ** 2
+            inner = (mean * noise[1, u, k]) ** 2 + (mean * noise[2, u, k]) ** 2
+            own, own_cubic = 0.25 * (outer + inner), 0.05 * (outer + 9.0 * inner)
+            coded = rounding_ohm[u, k] ** 2
             q, c = 0.0, 0.0
             if min(r0, r1, r2, r3) > 0.0 and 0.0 < own + coded < math.inf:
                 q = 0.5 * (r0 - r1 - r2 + r3)
                 c = _CUBIC * (r0 - 3.0 * r1 + 3.0 * r2 - r3)
                 if max(abs(q), abs(c)) > SAME * mean:
-                    quadratic[count], cubic[count] = q * q / (own + coded), c * c / (own + coded)
+                    quadratic[count], cubic[count] = q * q / (own + coded), c * c / (own_cubic + coded)
                     count += 1
                     share += own / (own + coded)
                     largest = max(largest, max(q * q, c * c) / coded)
@@ -177,7 +184,7 @@ def assess_block(
 
     Args:
         frames: (4, U, K) resistances, in ohms; NaN if invalid.
-        noise: (U, K) stated relative standard deviation of the resistances, excluding quantization.
+        noise: (4, U, K) stated relative standard deviation of the resistances, excluding quantization.
         rounding_ohm: (U, K) standard deviation of the quantization error, in ohms; 0 if unknown.
         quadratic: (U K,) work array.
         cubic: (U K,) work array.
@@ -221,7 +228,7 @@ class NoiseEstimate:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._frames = np.full((BLOCK, *shape), np.nan)
-        self._noise, self._rounding_ohm = np.ones(shape), np.zeros(shape)
+        self._noise, self._rounding_ohm = np.ones((BLOCK, *shape)), np.zeros(shape)
         self._work = np.empty((2, shape[0] * shape[1]))
         self.reset()
         self._assess()  # compiles the kernel before a stream starts
@@ -252,7 +259,7 @@ class NoiseEstimate:
             self._pause -= 1
             return False
         frame = self._frames[self._next]
-        frame[:] = ohm
+        frame[:], self._noise[self._next] = ohm, noise
         if valid is not None:
             frame[~valid] = np.nan
         self._next += 1
@@ -260,7 +267,6 @@ class NoiseEstimate:
             return False
         self._next = 0
         before = self.factor
-        self._noise[:] = noise
         self._rounding_ohm[:] = 0.0 if rounding_ohm is None else rounding_ohm
         self._assess()
         return self.factor != before

@@ -114,9 +114,10 @@ class PosteriorOptions(EstimateOptions):
 
     Args:
         scale_m: RMS normal displacement in the prior, in metres; by default, it is estimated from the data.
+            Not with the prior ``discs``.
 
     Raises:
-        ValueError: If an option is out of range.
+        ValueError: If an option is out of range, or the prior is ``discs`` and ``scale_m`` is given.
     """
 
     scale_m: float | None = None
@@ -125,6 +126,9 @@ class PosteriorOptions(EstimateOptions):
         super().__post_init__()
         if self.scale_m is not None:
             require_positive("scale_m", self.scale_m)
+            if self.prior == "discs":
+                allowed = "None with prior='discs', because the discs determine the prior"
+                raise ValueError(f"scale_m: got {self.scale_m}, must be {allowed}")
 
     @property
     def kernels(self) -> tuple[object, ...]:

@@ -7,11 +7,13 @@ calls per frame and ignores the drop counter. Structures and constants are from 
 
 from __future__ import annotations
 
+import json
 import select
 import socket
 import struct
 import subprocess
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import BusError
@@ -46,7 +48,7 @@ _NEWEST_NS: Final = 100_000_000
 """Maximum plausible lead (ns) of a frame's timestamp over the time at which the frame is read."""
 
 _IP_S: Final = 5.0
-"""Maximum duration (s) of an ``ip link`` command."""
+"""Maximum duration (s) of an ``ip`` command."""
 
 BATCH_FRAMES: Final = 256
 """Maximum number of frames per system call. A fully loaded 1 Mbit/s bus carries 256 frames in 30 ms."""
@@ -145,8 +147,32 @@ class SocketReader:
         return t_ns
 
 
+@dataclass(frozen=True, slots=True)
+class Link:
+    """State of a CAN interface as reported by ``ip``; None for each unknown value."""
+
+    up: bool | None = None
+    state: str | None = None
+    """State of the controller, such as ``ERROR-ACTIVE``."""
+    bitrate_bps: int | None = None
+    data_bitrate_bps: int | None = None
+
+
+def read_link(channel: str) -> Link:
+    """Return the state of the CAN interface ``channel``; this requires no privileges."""
+    try:
+        (link,) = json.loads(_ip("-details", "-json", "link", "show", "dev", channel))
+        data = link.get("linkinfo", {}).get("info_data", {})
+        rates = (data.get(key, {}).get("bitrate") for key in ("bittiming", "data_bittiming"))
+        return Link("UP" in link["flags"], data.get("state"), *rates)
+    except (OSError, subprocess.SubprocessError, ValueError, KeyError, AttributeError):
+        return Link()
+
+
 def set_link_bitrate(config: BusConfig) -> None:
     """Set the bit rates of a CAN interface with ``ip link``. The interface is down during the change.
+
+    If the interface is up and has these bit rates, it remains unchanged, and no privileges are required.
 
     Raises:
         BusError: if ``ip link`` fails. The message contains its error output.
@@ -154,6 +180,10 @@ def set_link_bitrate(config: BusConfig) -> None:
     rates = ["bitrate", str(config.bitrate_bps)]
     if config.fd:
         rates += ["dbitrate", str(config.data_bitrate_bps), "fd", "on"]
+    link = read_link(config.channel)
+    same = link.bitrate_bps == config.bitrate_bps
+    if link.up and same and (not config.fd or link.data_bitrate_bps == config.data_bitrate_bps):
+        return
     try:
         _ip_link(config, "down")
         try:
@@ -162,12 +192,20 @@ def set_link_bitrate(config: BusConfig) -> None:
             _ip_link(config, "up")
     except (OSError, subprocess.SubprocessError) as error:
         said = getattr(error, "stderr", "") or str(error)
+        channel, hint = config.channel, ""
+        if "not permitted" in said:
+            up = f"ip link set {channel} up type can {' '.join(rates)}"
+            hint = f"; as root, run: ip link set {channel} down && {up}"
         raise BusError(
-            f"{config.name}: interface 'socketcan', channel {config.channel!r}: does not accept "
-            f"{config.bitrate_bps} bit/s ({' '.join(said.split())})"
+            f"{config.name}: interface 'socketcan', channel {channel!r}: does not accept "
+            f"{config.bitrate_bps} bit/s ({' '.join(said.split())}){hint}"
         ) from error
 
 
 def _ip_link(config: BusConfig, *arguments: str) -> None:
-    command = ["ip", "link", "set", config.channel, *arguments]
-    subprocess.run(command, check=True, capture_output=True, text=True, timeout=_IP_S)
+    _ip("link", "set", config.channel, *arguments)
+
+
+def _ip(*arguments: str) -> str:
+    command = ["ip", *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=_IP_S).stdout

@@ -96,6 +96,18 @@ def test_a_running_hand_is_judged_and_not_disturbed(hand_file: HandFile, on: On)
     assert {host.health(patch.name).rejoins for patch in hand.patches} == {0}
 
 
+def test_scans_of_a_hand_with_a_long_sync_period_are_judged(
+    hand_file: HandFile, on: On, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An open wire shows in a single scan, even if the time for several would be too long."""
+    monkeypatch.setattr(collect_facts, "LONGEST_S", 0.4)
+    file = hand_file()
+    file.write_text(file.read_text().replace("period_ms = 25", "period_ms = 500"))
+    on(Fleet(load_hand(file))).patches["thumb"].fault = _cut_wire
+    done = run(["doctor", file, "--json", "--active"])
+    assert "thumb: upper wires open: 2" in findings(done)
+
+
 def _cut_wire(ohm: np.ndarray, t_ns: int) -> np.ndarray:
     ohm[2, :] = np.inf
     return ohm

@@ -10,7 +10,7 @@ import pytest
 
 from skinnode.config import BringUpConfig, HandConfig, Missing
 from skinnode.errors import ConfigError, NodeError, NodeTimeout
-from skinnode.host import Host, lifecycle, start
+from skinnode.host import Condition, Host, lifecycle, start
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.solve.detect import touch_test
@@ -25,6 +25,7 @@ class Node:
 
     def __init__(self, naps: int) -> None:
         self.naps = naps
+        self.heartbeat_s = 0.25
         self.has_other_master, self.patch = False, SimpleNamespace(name="thumb", bus="can0", node_id=5)
         self.stream, self.monitor = SimpleNamespace(withholdings=0), self
         self.nmt_state = 127
@@ -119,3 +120,13 @@ def test_solver_options_that_conflict_are_refused_before_the_nodes_are_asked(
     assert str(caught.value) == (
         "patch 'p0': got 'staggered', allowed: method: got 'exact' with drift, must be posterior or auto"
     )
+
+
+def test_nodes_start_although_their_heartbeats_are_rare(make_hand: Callable[..., HandConfig]) -> None:
+    """With the longest heartbeat period that a hand file can set."""
+    hand = make_hand(bring_up={"heartbeat_ms": 10_000})
+    with Fleet(hand), Host.from_config(hand) as host:
+        host.reset_node("p0")
+        assert eventually(lambda: host.health("p0").rejoins == 1, within_s=60.0)
+        assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
+        assert host.health("p0").complaint is None

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 from mcap_ros2._vendor.rosidl_adapter.parser import parse_message_string
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from skinnode.config import parse_hand
+from skinnode.messages import ros2_canopen
 from skinnode.messages.message_package import PACKAGE, package_files
 from skinnode.messages.typestore import typestore
 from tests.commands import run_here
@@ -56,6 +60,27 @@ def test_the_package_builds_every_message_with_what_it_uses() -> None:
         assert f"find_package({package} REQUIRED)" in cmake
         assert re.search(rf"DEPENDENCIES .*\b{package}\b", cmake)
     assert manifest.findtext("member_of_group") == "rosidl_interface_packages"
+
+
+def test_the_bus_package_depends_on_what_its_files_use() -> None:
+    """As REP 149 demands: what CMake finds, and at run time the drivers and what the launch file imports."""
+    hand = parse_hand(
+        {"name": "R&D <1>", "buses": [{"name": "can0"}], "patches": [{"name": "palm", "node_id": 5}]}
+    )
+    files = ros2_canopen.package_files(hand)
+    manifest = ElementTree.fromstring(files["r_d_1_canopen/package.xml"])
+    assert manifest.get("format") == "3"
+    assert manifest.findtext("name") == "r_d_1_canopen"
+    launch = ast.parse(files["r_d_1_canopen/launch/can0.launch.py"])
+    imported = {node.module for node in ast.walk(launch) if isinstance(node, ast.ImportFrom)}
+    modules = {str(module).split(".")[0] for module in imported} - sys.stdlib_module_names
+    shared = set(re.findall(r'get_package_share_directory\("(\w+)"\)', ast.unparse(launch).replace("'", '"')))
+    drivers = set(re.findall(r'package: "(\w+)"', files["r_d_1_canopen/config/can0/bus.yml"]))
+    needed = modules | drivers | shared - {"r_d_1_canopen"}
+    assert {each.text for each in manifest.findall("exec_depend")} == needed
+    found = set(re.findall(r"find_package\((\w+) REQUIRED\)", files["r_d_1_canopen/CMakeLists.txt"]))
+    built = [*manifest.findall("buildtool_depend"), *manifest.findall("build_depend")]
+    assert {each.text for each in built} == found
 
 
 def test_packages_of_two_hands_fit_into_one_workspace_and_nothing_is_overwritten(tmp_path: Path) -> None:

@@ -538,6 +538,15 @@ class TestSingleScan:
         desk.run(10)
         assert [can_id for can_id, _ in desk.take()] == [CHUNK] * 4 + [SUMMARY]
 
+    @pytest.mark.parametrize("ms", [10, 1])  # the SYNC comes after the chunks, or between them
+    def test_its_synchronous_summary_is_sent_before_the_scan_of_the_next_sync(self, desk, ms: int) -> None:
+        desk.start()
+        desk.node.on_frame(0x204, bytes.fromhex("000000000100"), desk.t_ns)
+        desk.run(ms)
+        frames = desk.take() + scan(desk, "")
+        assert [can_id for can_id, _ in frames] == ([CHUNK] * 4 + [SUMMARY]) * 2
+        assert [data[:2] for can_id, data in frames if can_id == SUMMARY] == ["00", "01"]
+
     def test_is_refused_where_sync_numbers_the_scans(self, operational) -> None:
         assert operational.sdo("2f 21 20 05 01 00 00 00").endswith("22 00 00 08")
         assert operational.frame(0x204, "00 00 00 00 01 00") == []

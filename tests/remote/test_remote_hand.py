@@ -122,6 +122,10 @@ def test_commands(start: Callable[..., Process], port: int) -> None:
         with pytest.raises(NodeTimeout, match=r"node 5.*no new baseline"):
             hand.tare("p1", deadline_s=0.0)
         assert hand.stats().events_lost == 0
+    for command in (hand.tare, hand.reset_node):
+        with pytest.raises(SkinError, match=r"^hand 'hand': this program has closed the connection$"):
+            command("p0")
+    assert hand.health("p0").condition is Condition.LOST
 
 
 @pytest.mark.parametrize("name", ["", " ", "left\nhand", "\udcff"])

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import queue
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack
 from types import FrameType
+from typing import Any
 
 import can
 import pytest
 
 from skinnode.process import clock
+from vcan_sim import virtual_time
 from vcan_sim.event_loop import run
 from vcan_sim.timed_interface import MOST_STATIONS
 from vcan_sim.virtual_time import READINGS, START_NS, Deadlock, VirtualClock
@@ -385,3 +389,67 @@ def test_an_exception_of_a_signal_handler_waits_for_its_turn(raising_signal: sig
                     thread.join()
     assert interrupted > items // 2
     assert set(late_ns) == {0}
+
+
+def interrupted_at(step: int) -> bool:
+    """Raise Interrupted at a line of the clock that the first thread executes; return whether it did."""
+    left, running = step, False
+
+    def count(frame: FrameType, event: str, _argument: object) -> Any:
+        nonlocal left
+        if frame.f_code.co_filename != virtual_time.__file__:
+            return None
+        left -= event == "line"
+        if event == "line" and not left:
+            raise Interrupted
+        return count
+
+    def echo() -> None:
+        nonlocal running
+        while requests.get() is not None:
+            running = True  # until it waits
+            answers.put(None)
+            time.sleep(0)
+            running = False
+
+    def nap() -> None:
+        while not ended.is_set():
+            clock.sleep(0.001)
+
+    with VirtualClock():
+        requests, answers, ended = clock.queue(), clock.queue(), clock.event()
+        threads = [clock.thread(echo, "echo", ()), clock.thread(nap, "nap", ())]
+        for thread in threads:
+            thread.start()
+        sys.settrace(count)
+        try:
+            for _ in range(2):
+                requests.put(0)
+                answers.get()
+                clock.sleep(0.0005)
+        except Interrupted:
+            assert not running
+        finally:
+            sys.settrace(None)
+        ended.set()
+        requests.put(None)
+        for thread in threads:
+            thread.join()
+    return left <= 0
+
+
+def test_an_exception_of_a_signal_handler_may_come_at_any_step_of_a_hand_over() -> None:
+    """It must neither let two threads run at once nor lose the turn of another thread."""
+    for step in itertools.count(1):
+        reached = Future[bool]()
+
+        def attempt(step: int = step, reached: Future[bool] = reached) -> None:
+            try:
+                reached.set_result(interrupted_at(step))
+            except BaseException as error:
+                reached.set_exception(error)
+
+        threading.Thread(target=attempt, daemon=True).start()
+        if not reached.result(timeout=60.0):
+            break
+    assert step > 100

@@ -50,6 +50,18 @@ def test_noise_that_changes_in_the_stream_is_estimated_and_forgotten(rest: np.nd
     assert set(factors[210:]) == {1.0}
 
 
+@pytest.mark.parametrize("wrong", [*WRONG, 1.0])
+@pytest.mark.parametrize("levels", [(1e-5, 1e-4), (1e-4, 1e-5), (1e-5, 1e-5, 1e-4)])
+def test_stated_noise_that_changes_from_frame_to_frame(
+    rest: np.ndarray, levels: tuple[float, ...], wrong: float
+) -> None:
+    stated = np.resize(levels, 100)
+    estimate = NoiseEstimate(rest.shape)
+    for frame, sigma in zip(at_rest(rest, 1.0, 100) / rest - 1.0, stated, strict=True):
+        estimate.see(rest * (1.0 + wrong * sigma * frame), np.full(rest.shape, sigma))
+    assert estimate.factor == pytest.approx(wrong, rel=0.15 * (wrong != 1.0))
+
+
 @pytest.mark.parametrize("wrong", [0.7, 0.85, 1.0, 1.15, 1.3])
 def test_nearly_right_noise_stays_as_stated(rest: np.ndarray, wrong: float) -> None:
     assert set(found(at_rest(rest, wrong * 1e-5, 2000), 1e-5)) == {1.0}

@@ -66,6 +66,8 @@ def test_a_name_that_is_no_option_and_options_of_another_kind_are_type_errors(la
         sk.Posterior(layout, TrackerOptions())
     with pytest.raises(ValueError, match=r"scale_m: got -1\.0, must be positive"):
         sk.Posterior(layout, scale_m=-1.0)
+    with pytest.raises(ValueError, match=r"scale_m: got 0\.0001, must be None with prior='discs', because"):
+        sk.Posterior(layout, scale_m=1e-4, prior="discs")
 
 
 def test_of_posterior_takes_over_what_both_have():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import socket
 import subprocess
 import time
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +15,7 @@ from skinnode.config import BusConfig
 from skinnode.errors import BusError
 from skinnode.transport import CanPort, Frame
 from skinnode.transport.hardware_time import HardwareClock
+from skinnode.transport.socketcan import set_link_bitrate
 
 VCAN = BusConfig(name="can7", interface="socketcan", channel="vcan0")
 MS = 1_000_000
@@ -77,6 +80,36 @@ def test_a_link_without_a_bit_rate_says_so_and_is_up_again() -> None:
         frame = theirs.recv(1.0)
         assert frame is not None
         assert frame.data == b"here"
+
+
+IP = """\
+#!/bin/sh
+echo "$*" >> "$0.calls"
+case "$*" in
+*show*) echo '[{"flags": ["NOARP", "UP"], "linkinfo": {"info_data": {"bittiming": {"bitrate": 500000}}}}]' ;;
+*) echo "RTNETLINK answers: Operation not permitted" >&2; exit 2 ;;
+esac
+"""
+
+
+def test_a_bit_rate_that_the_link_has_needs_no_privileges_and_another_one_is_refused_with_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for a board that starts with a stored bit rate: at another one, it would disturb the bus."""
+    program = tmp_path / "ip"
+    program.write_text(IP)
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    config = BusConfig(name="can7", interface="socketcan", channel="can3", bitrate_bps=500_000)
+    set_link_bitrate(config)
+    assert "set" not in Path(f"{program}.calls").read_text()
+    with pytest.raises(BusError) as refused:
+        set_link_bitrate(config.model_copy(update={"bitrate_bps": 250_000}))
+    assert str(refused.value) == (
+        "can7: interface 'socketcan', channel 'can3': does not accept 250000 bit/s (RTNETLINK answers: "
+        "Operation not permitted); as root, run: ip link set can3 down && ip link set can3 up type can "
+        "bitrate 250000"
+    )
 
 
 def test_hardware_stamps_keep_a_frames_time_however_late_the_kernel_was() -> None:

@@ -146,8 +146,7 @@ class PatchApplication:
             t_ns: Arrival time of the SYNC, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # this SYNC does not start a scan
-            self.stream.on_sync(turns, t_ns)
+        self.stream.on_sync(turns, t_ns, starts_scan=scans and not self.stream.full)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
 
@@ -156,7 +155,7 @@ class PatchApplication:
         self.stream.on_timer(t_ns)
         if t_ns >= self._scan_ns:
             self._scan_ns = max(self._scan_ns + self._period_ns, t_ns)
-            self._scan(self._following(), frozenset(), t_ns)
+            self._scan(self._following(), None, t_ns)
 
     # --- baseline
 
@@ -189,8 +188,14 @@ class PatchApplication:
     def _following(self) -> int:
         return self._counter + 1 & 0xFF
 
-    def _scan(self, counter: int, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan and queue it, or skip it if another scan is already waiting."""
+    def _scan(self, counter: int, turns: frozenset[int] | None, t_ns: int) -> None:
+        """Take a scan and queue it, or skip it if another scan is already waiting.
+
+        Args:
+            counter: Scan counter.
+            turns: Numbers of the synchronous TPDOs that are due at the SYNC; None if no SYNC starts the scan.
+            t_ns: Current time, in ns.
+        """
         self._counter = counter
         if self.stream.full:
             self._acquisition.selection.forget()  # receivers notice the gap
@@ -296,7 +301,7 @@ class PatchApplication:
             self._run_self_test(self._now())
         elif subindex == od.SINGLE_SCAN and store.integer(od.ACQUISITION, od.SINGLE_SCAN):
             store.put(od.ACQUISITION, od.SINGLE_SCAN, 0)
-            self._scan(self._following(), frozenset(), self._now())
+            self._scan(self._following(), None, self._now())
 
     def _run_self_test(self, t_ns: int) -> None:
         acquisition = self._acquisition

@@ -3,8 +3,9 @@
 Chunks are sent in the first TPDO whose first mapped object is 0x2010 and that is event-driven or due at the
 SYNC that starts the scan. The summary is sent in every TPDO whose first mapped object is 0x2011. If such a
 TPDO is event-driven, or was due at the SYNC that started the scan, it immediately follows the chunks.
-Otherwise, it is sent at the next SYNC at which it is due. The end of a scan also triggers all event-driven
-TPDOs that contain other objects.
+Otherwise, it is sent at the next SYNC at which it is due, unless that SYNC starts a scan and the summary
+belongs to a scan that an earlier SYNC started: then only the summary of the new scan is sent. The end of a
+scan also triggers all event-driven TPDOs that contain other objects.
 
 **Pacing.** CiA 301 defines the inhibit time as a minimum interval between frames. Under a general-purpose
 operating system, threads can wake up late, so with a strict minimum interval, a scan could take longer than
@@ -31,8 +32,8 @@ synchronous window: in a full scan, there would be more of them.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Final
 
 from skinnode.canopen import indices as od
@@ -61,8 +62,9 @@ class OutgoingScan:
     """Time of the scan on the node's clock in µs, modulo 2³²."""
     check_of_codes: int | None = None
     """CRC over the codes that the receiver will have after this scan; None for a summary without a check."""
-    turns: frozenset[int] = frozenset()
-    """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
+    turns: frozenset[int] | None = None
+    """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan; None if no SYNC
+    started it."""
 
 
 class ScanStream:
@@ -87,6 +89,7 @@ class ScanStream:
         self._tpdos, self._catch_up_ns, self._on_lost = tpdos, catch_up_ns, on_lost
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
+        self._ended: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
         self._carrier: Tpdo | None = None  # TPDO of the current scan's chunks
         self._unsent: deque[bytes] = deque()
@@ -149,8 +152,22 @@ class ScanStream:
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
-    def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """Send the summaries that are due at a SYNC that does not start a scan."""
+    def on_sync(self, turns: frozenset[int], t_ns: int, *, starts_scan: bool) -> None:
+        """Send the waiting summaries that are due at a SYNC.
+
+        If the SYNC starts a scan, only the summary of a scan that no SYNC started is sent. If that scan is
+        still being sent, its summary follows its chunks.
+
+        Args:
+            turns: Numbers of the synchronous TPDOs that are due.
+            t_ns: Current time, in ns.
+            starts_scan: Whether the SYNC starts a scan.
+        """
+        if starts_scan:
+            if self._scan is not None and self._scan.turns is None:
+                self._scan = replace(self._scan, turns=turns)
+            if self._ended is None or self._ended.turns is not None:
+                return
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.waiting and tpdo.number in turns:
                 self._tpdos.transmit(tpdo, t_ns)
@@ -195,7 +212,7 @@ class ScanStream:
     def _begin(self, scan: OutgoingScan, t_ns: int) -> None:
         self._scan, self._carrier, self._chunks_sent, self._cut_off = scan, None, 0, False
         for tpdo in self._tpdos.owned(od.CHUNK):
-            if tpdo.parameters.event_driven or tpdo.number in scan.turns:
+            if tpdo.parameters.event_driven or tpdo.number in (scan.turns or ()):
                 self._carrier = tpdo
                 self._verbatim = bool(scan.chunks) and self._carries_record(tpdo)
                 tpdo.waiting = False
@@ -239,10 +256,11 @@ class ScanStream:
         )
         self.summary = pack_summary_record(payload, scan.device_time_us)
         self.scans_sent += 1
+        self._ended = scan
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.parameters.event_driven:
                 self._tpdos.request(tpdo, t_ns)
-            elif tpdo.number in scan.turns:
+            elif tpdo.number in (scan.turns or ()):
                 self._tpdos.transmit(tpdo, t_ns)
             else:
                 tpdo.waiting = True

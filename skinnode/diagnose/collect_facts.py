@@ -8,13 +8,13 @@ from __future__ import annotations
 import functools
 import json
 import subprocess
-import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
 
+from skinnode.process import clock
 from skinnode.bus_load.plan import SCAN_SHARE, inhibit_time_100us
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtCommand, encode
@@ -110,7 +110,7 @@ def _wanted(patch: PatchConfig, hand: HandConfig, bus: BusConfig) -> PatchFacts:
 def _examine(
     connection: BusConnection, facts: BusFacts, hand: HandConfig | None, active: bool, progress: Progress
 ) -> BusFacts:
-    begun_s = time.monotonic()
+    begun_s = clock.monotonic()
     capture = ScanCapture()
     connection.link.listen(capture.on_frames)
     found = discover(connection, lambda text: progress(f"{facts.name}: {text}"))
@@ -146,7 +146,7 @@ def _examine(
     heard = connection.listener
     return replace(
         facts,
-        seconds=time.monotonic() - begun_s,
+        seconds=clock.monotonic() - begun_s,
         frames=stats.received,
         load=max(load, stats.load),
         error_frames=heard.errors,
@@ -176,7 +176,7 @@ def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
     """
     failure = ""
     for pause_s in _PAUSES_S:
-        time.sleep(pause_s)
+        clock.sleep(pause_s)
         try:
             return question(), ""
         except NodeError as error:
@@ -214,17 +214,17 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
         heard = len(capture.syncs)
         connection.wait_until(lambda: len(capture.syncs) > heard, max(_FIRST_SYNC_S, 2.5 * period_s))
         ours = active and len(capture.syncs) == heard
-        due_s, end_s = time.monotonic(), time.monotonic() + min(LONGEST_S, 2 * SCANS * period_s)
+        due_s, end_s = clock.monotonic(), clock.monotonic() + min(LONGEST_S, 2 * SCANS * period_s)
         number, load = 0, 0.0
-        while min(map(capture.scans, running)) < SCANS and time.monotonic() < end_s:
+        while min(map(capture.scans, running)) < SCANS and clock.monotonic() < end_s:
             if ours:
                 number += 1
                 overflow = max(overflows.values())
                 counter = (number - 1) % overflow + 1 if overflow else 0
-                capture.note_sync(time.monotonic_ns(), counter)
+                capture.note_sync(clock.monotonic_ns(), counter)
                 connection.link.send(od.SYNC_COB_ID, bytes((counter,)) if counter else b"")
             due_s += period_s
-            connection.wait_until(lambda: False, max(0.0, due_s - time.monotonic()))
+            connection.wait_until(lambda: False, max(0.0, due_s - clock.monotonic()))
             load = max(load, connection.link.stats().load)
             progress(f"{min(map(capture.scans, running))} of {SCANS} scans")
         return ours, load

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.canopen import nmt
 from skinnode.canopen.lss import LssAddress
@@ -107,7 +107,7 @@ def commission(
     booted = True
     if node_id is not None and node_id != before:
         if before is not None:
-            time.sleep(0.01)  # the node must first switch to LSS waiting mode
+            clock.sleep(0.01)  # the node must first switch to LSS waiting mode
             connection.link.send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, before))
         booted = connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > boot_ups, BOOT_S)
         if not booted:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 
+from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.diagnose.facts import ScanFacts
 from skinnode.protocol.assembler import ScanAssembler
@@ -87,7 +87,7 @@ class ScanCapture:
             stated_noise: Relative noise of the patch's converter, according to the hand file.
         """
         patch = self._patches[node_id]
-        patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
+        patch.keep(patch.assembler.poll(clock.monotonic_ns()), self._sync_ns)
         scans = list(patch.scans)
         if not scans:
             return None

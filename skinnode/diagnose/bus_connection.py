@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import state_name
 from skinnode.config import BusConfig
@@ -15,6 +14,7 @@ from skinnode.host.link import BusLink
 from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import Abandoned, RemoteOd
+from skinnode.process import clock
 from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5

@@ -14,7 +14,6 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from skinnode.process import clock
 from skinnode.bus_load.plan import SCAN_SHARE, inhibit_time_100us
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtCommand, encode
@@ -28,6 +27,7 @@ from skinnode.diagnose.node_info import read_info
 from skinnode.diagnose.scan_capture import ScanCapture
 from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
+from skinnode.process import clock
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 

@@ -12,13 +12,13 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Final
 
-from skinnode.process import clock
 from skinnode.bus_load.timing import worst_case_bits
 from skinnode.canopen import indices as od
 from skinnode.canopen.lss import LssAddress
 from skinnode.canopen.sdo import upload_request
 from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.errors import NodeError
+from skinnode.process import clock
 from skinnode.text.printable import printable
 from skinnode.text.words import counted
 

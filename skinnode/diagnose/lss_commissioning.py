@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.canopen import nmt
 from skinnode.canopen.lss import LssAddress
@@ -15,6 +14,7 @@ from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.diagnose.discovery import find_unconfigured
 from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
+from skinnode.process import clock
 
 BOOT_S: Final = 5.0
 """Maximum time for a node to boot with its new node-ID, in s."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, state_name
 from skinnode.diagnose.bus_connection import BusConnection, State
+from skinnode.process import clock
 
 FOLLOW_S: Final = 1.5
 """Maximum time for a node to report its new state in s, in addition to two heartbeat periods."""

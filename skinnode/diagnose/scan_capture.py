@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.diagnose.facts import ScanFacts
+from skinnode.process import clock
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile

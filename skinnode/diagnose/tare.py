@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 
-from skinnode.process import clock
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.nmt import NmtState
@@ -25,6 +24,7 @@ from skinnode.errors import BusError, NodeError, SdoAbort
 from skinnode.host.sdo_client import RemoteOd
 from skinnode.model.baseline_change import touched_crossings
 from skinnode.model.layout import Float
+from skinnode.process import clock
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3

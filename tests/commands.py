@@ -17,6 +17,9 @@ from unittest import mock
 
 import skinnode.cli.main
 import vcan_sim.cli
+from skinnode.config import BusConfig
+from skinnode.transport import CanPort
+from vcan_sim.virtual_time import VirtualClock
 
 MAINS = {"skinnode": skinnode.cli.main.main, "vcan-sim": vcan_sim.cli.main}
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -54,6 +57,17 @@ def run_here(
             status = int(ended.code or 0)
     said = out.getvalue() if isinstance(out, Output) else ""
     return subprocess.CompletedProcess(list(arguments), status, said, err.getvalue())
+
+
+@contextlib.contextmanager
+def virtual_time(*channels: str) -> Iterator[None]:
+    """Virtual time for commands that wait, on timed buses on which another device hears all frames.
+
+    On a bus with one device, its first frame would be sent again and again, as nobody acknowledges it."""
+    with VirtualClock(), contextlib.ExitStack() as devices:
+        for channel in channels:
+            devices.enter_context(CanPort(BusConfig(interface="timed", channel=channel)))
+        yield
 
 
 def run_for_nobody(*arguments: str, program: str = "skinnode") -> subprocess.CompletedProcess[str]:

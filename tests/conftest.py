@@ -110,8 +110,8 @@ def bus_on(interface: str, group: str) -> BusConfig:
     Skips where multicast is not."""
     if interface == "udp_multicast" and not has_multicast():
         pytest.skip("no multicast on this machine")
-    channels = {"virtual": uuid.uuid4().hex, "udp_multicast": group, "socketcan": "vcan0"}
-    return BusConfig(name="can7", interface=interface, channel=channels[interface])
+    channel = {"udp_multicast": group, "socketcan": "vcan0"}.get(interface, uuid.uuid4().hex)
+    return BusConfig(name="can7", interface=interface, channel=channel)
 
 
 @pytest.fixture(params=EVERY_INTERFACE)

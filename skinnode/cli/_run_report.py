@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Protocol
 
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -170,12 +170,12 @@ def reason(health: PatchHealth, before: str = "") -> str:
 
 def _let_overruns_end(running: Host) -> None:
     """Give nodes on slow computers time to clear their overrun emergencies."""
-    end_s = time.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
-    while time.monotonic() < end_s:
+    end_s = clock.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
+    while clock.monotonic() < end_s:
         healths = [running.health(patch.name) for patch in running.hand.patches]
         if not any(h.condition in ("faulty", "stale") and h.slow_overruns for h in healths):
             return
-        time.sleep(_POLL_S)
+        clock.sleep(_POLL_S)
 
 
 class Second:

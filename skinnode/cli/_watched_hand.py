@@ -115,10 +115,9 @@ def watched(options: WatchOptions, tell: Callable[[str], None]) -> Iterator[Watc
 
 @contextmanager
 def _remote(name: str, zenoh: ZenohOptions, tell: Callable[[str], None]) -> Iterator[WatchedSource]:
-    import time
-
     session = zenoh.session("--remote")
     from skinnode.monitor.live_source import RemoteSource
+    from skinnode.process import clock
     from skinnode.remote import connect
 
     tell(f"connecting to {name!r}")
@@ -126,7 +125,7 @@ def _remote(name: str, zenoh: ZenohOptions, tell: Callable[[str], None]) -> Iter
         yield WatchedSource(
             remote.hand,
             remote.hand.name,
-            time.time_ns() - time.monotonic_ns(),
+            clock.time_ns() - clock.monotonic_ns(),
             lambda stack, stop, tell: stack.enter_context(RemoteSource(remote)),
         )
 
@@ -149,14 +148,14 @@ def _recording(path: Path, speed: float) -> Iterator[WatchedSource]:
 
 
 def _host(options: WatchOptions) -> WatchedSource:
-    import time
+    from skinnode.process import clock
 
     plan = _plan(options)
 
     def start(stack: ExitStack, stop: threading.Event, tell: Callable[[str], None]) -> Source:
         return _running(stack, plan, stop, simulate=options.simulate, tell=tell)
 
-    return WatchedSource(plan, plan.name, time.time_ns() - time.monotonic_ns(), start)
+    return WatchedSource(plan, plan.name, clock.time_ns() - clock.monotonic_ns(), start)
 
 
 def _plan(options: WatchOptions) -> HandConfig:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +11,7 @@ import typer
 from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
 from skinnode.cli._publish import AskedPublication, Commands, Listen, Publish, asked_publication
 from skinnode.cli._zenoh_options import Router, ZenohConfig, ZenohOptions
+from skinnode.process import clock
 
 if TYPE_CHECKING:
     from skinnode.cli._run_report import Report
@@ -119,7 +119,7 @@ def _watch(running: Host, stop: threading.Event, seconds: float | None, report: 
     """Collect the fields; report touches as they happen, and the host's state every second."""
     from skinnode.cli._run_report import Second
 
-    start_s = time.monotonic()
+    start_s = clock.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     latencies_s: list[float] = []
     events = running.events()
@@ -127,7 +127,7 @@ def _watch(running: Host, stop: threading.Event, seconds: float | None, report: 
         before, due_s = running.stats(), start_s + 1.0
         while not stop.is_set():
             _note_touches(events, report)
-            now_s = time.monotonic()
+            now_s = clock.monotonic()
             if now_s >= min(due_s, end_s):
                 now = running.stats()
                 report.second(Second(running, now_s - start_s, before, now, latencies_s, fields.dropped))

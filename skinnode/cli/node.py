@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -16,6 +15,7 @@ import typer
 
 from skinnode.cli._layout_option import HELP as LAYOUT_HELP
 from skinnode.cli._options import JsonLines, Seconds
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -223,11 +223,11 @@ def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
     """Print a line every second until the command is stopped, the duration has elapsed or the node stops."""
-    start_s = time.monotonic()
+    start_s = clock.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0
-    while not stop.wait(max(0.0, min(due_s, end_s) - time.monotonic())) and not runner.failed:
-        now_s = time.monotonic()
+    while not stop.wait(max(0.0, min(due_s, end_s) - clock.monotonic())) and not runner.failed:
+        now_s = clock.monotonic()
         now = _progress(runner, port, now_s - start_s)
         print(json.dumps(asdict(now)) if as_json else _line(before, now), flush=True)
         before, due_s = now, due_s + 1.0

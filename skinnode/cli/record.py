@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -141,11 +141,11 @@ def _follow(
 
     ``check`` is called before each line is printed; its exceptions propagate.
     """
-    start_s = time.monotonic()
+    start_s = clock.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0
-    while not stop.wait(max(0.0, min(due_s, end_s) - time.monotonic())):
-        now_s = time.monotonic()
+    while not stop.wait(max(0.0, min(due_s, end_s) - clock.monotonic())):
+        now_s = clock.monotonic()
         check()
         stats = recorder.stats()
         _say(as_json, elapsed_s=round(now_s - start_s, 1), frames=stats.frames, dropped=stats.dropped)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -16,6 +14,7 @@ from skinnode.host.link import BusLink
 from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import Abandoned, RemoteOd
+from skinnode.process import clock
 from skinnode.process.closing import Closing
 
 LONGEST_HEARTBEAT_S: Final = 2.5
@@ -73,7 +72,7 @@ class BusConnection(Closing):
         self.defect: SkinError | None = None
         """Internal error of the receiving thread; None if there is none."""
         self._remotes: dict[int, RemoteOd] = {}
-        self._abandoned = threading.Event()
+        self._abandoned = clock.event()
         self.link = BusLink(bus, {}, self._on_defect)
         self.link.listen(self.listener.on_frames)
         self.lss = LssMaster(self.link.send)
@@ -105,7 +104,7 @@ class BusConnection(Closing):
             BusError: The bus failed during the wait.
             Abandoned: :meth:`abandon` has been called.
         """
-        end_s = time.monotonic() + within_s
+        end_s = clock.monotonic() + within_s
         while not condition():
             if self.defect is not None:
                 raise self.defect
@@ -113,14 +112,14 @@ class BusConnection(Closing):
                 raise BusError(str(self.link.failure)) from self.link.failure
             if self._abandoned.is_set():
                 raise Abandoned
-            if time.monotonic() > end_s:
+            if clock.monotonic() > end_s:
                 return False
-            time.sleep(_POLL_S)
+            clock.sleep(_POLL_S)
         return True
 
     def ask_all(self, node_id: int, request: bytes, within_s: float) -> list[bytes]:
         """Send an SDO request and return all responses; there are several if nodes share the node-ID."""
-        since_ns = time.monotonic_ns()
+        since_ns = clock.monotonic_ns()
         self.link.send(od.sdo_request_cob_id(node_id), request.ljust(8, b"\0"))
         self.wait_until(lambda: False, within_s)
         answers = list(self.listener.node(node_id).sdo_answers)
@@ -136,7 +135,7 @@ class BusConnection(Closing):
         Raises:
             NodeError: The node sends no valid response.
         """
-        remote, since_ns = self.od(node_id), time.monotonic_ns()
+        remote, since_ns = self.od(node_id), clock.monotonic_ns()
         if not remote.answers() and not remote.answers():
             raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
 
@@ -194,7 +193,7 @@ class BusConnection(Closing):
         if not guarding:
             return State(None, "no heartbeat; no remote frame was sent, because it might start life guarding")
         for answer_s in GUARD_ANSWERS_S:
-            asked_ns = time.monotonic_ns()
+            asked_ns = clock.monotonic_ns()
             self.link.ask_remote(od.heartbeat_cob_id(node_id))
             beat = self._beat(node_id, asked_ns, answer_s)
             if beat is not None:

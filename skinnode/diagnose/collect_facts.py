@@ -6,7 +6,6 @@ A running hand is not disturbed: nodes are started and SYNC is sent only if ``ac
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Final, TypeVar
@@ -26,6 +25,7 @@ from skinnode.diagnose.node_info import read_info
 from skinnode.diagnose.scan_capture import ScanCapture
 from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
+from skinnode.process import clock
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 from skinnode.transport.socketcan import read_link
@@ -113,7 +113,7 @@ def _wanted(patch: PatchConfig, hand: HandConfig, bus: BusConfig) -> PatchFacts:
 def _examine(
     connection: BusConnection, facts: BusFacts, hand: HandConfig | None, active: bool, progress: Progress
 ) -> BusFacts:
-    begun_s = time.monotonic()
+    begun_s = clock.monotonic()
     capture = ScanCapture()
     connection.link.listen(capture.on_frames)
     found = discover(connection, lambda text: progress(f"{facts.name}: {text}"))
@@ -149,7 +149,7 @@ def _examine(
     heard = connection.listener
     return replace(
         facts,
-        seconds=time.monotonic() - begun_s,
+        seconds=clock.monotonic() - begun_s,
         frames=stats.received,
         load=max(load, stats.load),
         error_frames=heard.errors,
@@ -179,7 +179,7 @@ def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
     """
     failure = ""
     for pause_s in _PAUSES_S:
-        time.sleep(pause_s)
+        clock.sleep(pause_s)
         try:
             return question(), ""
         except NodeError as error:
@@ -217,17 +217,17 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
         heard = len(capture.syncs)
         connection.wait_until(lambda: len(capture.syncs) > heard, max(_FIRST_SYNC_S, 2.5 * period_s))
         ours = active and len(capture.syncs) == heard
-        due_s, end_s = time.monotonic(), time.monotonic() + _capture_s(period_s)
+        due_s, end_s = clock.monotonic(), clock.monotonic() + _capture_s(period_s)
         number, load = 0, 0.0
-        while min(map(capture.scans, running)) < SCANS and time.monotonic() < end_s:
+        while min(map(capture.scans, running)) < SCANS and clock.monotonic() < end_s:
             if ours:
                 number += 1
                 overflow = max(overflows.values())
                 counter = (number - 1) % overflow + 1 if overflow else 0
-                capture.note_sync(time.monotonic_ns(), counter)
+                capture.note_sync(clock.monotonic_ns(), counter)
                 connection.link.send(od.SYNC_COB_ID, bytes((counter,)) if counter else b"")
             due_s += period_s
-            connection.wait_until(lambda: False, max(0.0, due_s - time.monotonic()))
+            connection.wait_until(lambda: False, max(0.0, due_s - clock.monotonic()))
             load = max(load, connection.link.stats().load)
             progress(f"{min(map(capture.scans, running))} of {SCANS} scans")
         return ours, load

@@ -7,11 +7,10 @@ else on any node.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from skinnode.bus_load.timing import worst_case_bits
 from skinnode.canopen import indices as od
@@ -19,6 +18,7 @@ from skinnode.canopen.lss import LssAddress
 from skinnode.canopen.sdo import upload_request
 from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.errors import NodeError
+from skinnode.process import clock
 from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
@@ -127,18 +127,20 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
     Raises:
         BusError: The bus failed.
     """
-    begun_s = time.monotonic()
+    begun_s = clock.monotonic()
     _let_others_finish(connection)
-    asked_ns = time.monotonic_ns()
-    with ThreadPoolExecutor(_THREADS, thread_name_prefix="discovery") as pool:
+    asked_ns = clock.monotonic_ns()
+    with clock.pool(_THREADS, "discovery") as pool:
         try:
             lss = pool.submit(find_unconfigured, connection)
             progress("querying node-IDs 1 to 127")
             answered = _sweep(connection)
             progress(f"{counted(len(answered), 'node answers', 'nodes answer')}; reading identities")
             jobs = [pool.submit(_examine, connection, node_id, count) for node_id, count in answered.items()]
+            _wait_for(jobs)
             nodes = [job.result() for job in jobs]
-            connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
+            connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - clock.monotonic()))
+            _wait_for([lss])
             unconfigured, more = lss.result()
         except BaseException:  # the pool's threads must end on Ctrl-C, too
             connection.abandon()
@@ -146,7 +148,16 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
     heard = connection.listener.nodes
     silent = [_only_heard(connection, node_id, asked_ns) for node_id in heard if node_id not in answered]
     found = sorted((*nodes, *filter(None, silent)), key=lambda node: node.node_id)
-    return Discovery(tuple(found), unconfigured, more, time.monotonic() - begun_s)
+    return Discovery(tuple(found), unconfigured, more, clock.monotonic() - begun_s)
+
+
+def _wait_for(jobs: Sequence[Future[Any]]) -> None:
+    """Wait until all jobs have ended."""
+    ended = clock.simple_queue()
+    for job in jobs:
+        job.add_done_callback(ended.put)
+    for _ in jobs:
+        ended.get()
 
 
 def _let_others_finish(connection: BusConnection) -> None:
@@ -154,8 +165,8 @@ def _let_others_finish(connection: BusConnection) -> None:
 
     A host performs SDO transfers mainly during bring-up.
     """
-    end_s = time.monotonic() + OTHERS_S
-    while time.monotonic() < end_s:
+    end_s = clock.monotonic() + OTHERS_S
+    while clock.monotonic() < end_s:
         before = _sdo_frames(connection)
         connection.wait_until(lambda: False, _QUIET_S)
         if _sdo_frames(connection) == before:
@@ -174,11 +185,11 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
         The LSS addresses found, and True if there are more such nodes.
     """
     found: list[LssAddress] = []
-    end_s = time.monotonic() + LSS_S
+    end_s = clock.monotonic() + LSS_S
     if not connection.lss.any_unconfigured():
         return (), False
     try:
-        while time.monotonic() < end_s:
+        while clock.monotonic() < end_s:
             address = connection.lss.find_unconfigured()
             if address is None or address in found:
                 return tuple(found), not found
@@ -193,11 +204,11 @@ def _sweep(connection: BusConnection) -> dict[int, int]:
     answers: dict[int, int] = {}
     pace_s = max(PACE_S, PACE_FRAMES * worst_case_bits(8) / connection.bus.bitrate_bps)
     for _ in range(SWEEPS):
-        asked_ns = time.monotonic_ns()
+        asked_ns = clock.monotonic_ns()
         for node_id in range(1, od.MAX_NODE_ID + 1):
             if node_id not in answers:
                 connection.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE)
-                time.sleep(pace_s)
+                clock.sleep(pace_s)
         connection.wait_until(lambda: False, ANSWER_S)
         for node_id, heard in connection.listener.nodes.items():
             count = sum(

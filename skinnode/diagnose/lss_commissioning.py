@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -15,6 +14,7 @@ from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.diagnose.discovery import find_unconfigured
 from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
+from skinnode.process import clock
 
 BOOT_S: Final = 5.0
 """Maximum time for a node to boot with its new node-ID, in s."""
@@ -107,7 +107,7 @@ def commission(
     booted = True
     if node_id is not None and node_id != before:
         if before is not None:
-            time.sleep(0.01)  # the node must first switch to LSS waiting mode
+            clock.sleep(0.01)  # the node must first switch to LSS waiting mode
             connection.link.send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, before))
         booted = connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > boot_ups, BOOT_S)
         if not booted:

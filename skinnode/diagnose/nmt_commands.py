@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -11,6 +10,7 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, state_name
 from skinnode.diagnose.bus_connection import BusConnection, State
+from skinnode.process import clock
 
 FOLLOW_S: Final = 1.5
 """Maximum time for a node to report its new state in s, in addition to two heartbeat periods."""
@@ -83,7 +83,7 @@ def command_nodes(
         BusError: The bus failed.
     """
     watches = [_watch(connection, node_id) for node_id in node_ids]
-    sent_ns = time.monotonic_ns()
+    sent_ns = clock.monotonic_ns()
     for node_id in [ALL_NODES] if at_once else node_ids:
         connection.link.send(od.NMT_COB_ID, encode(_SPECIFIERS[command], node_id))
     if command.resets:
@@ -102,15 +102,15 @@ def _watch(connection: BusConnection, node_id: int) -> _Watch:
 def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
     """Wait until the node reports the commanded state or the time limit expires."""
     wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
-    end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
+    end_s = clock.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:
         now = connection.state(watch.node_id, watch.heartbeat_s, guarding=watch.guarding, since_ns=since_ns)
         if now.state == wanted:
             return Change(watch.node_id, str(watch.before), str(now), True, now.how)
-        if time.monotonic() > end_s:
+        if clock.monotonic() > end_s:
             why = now.how if now.state is None else f"by {now.how}, not {state_name(wanted)}"
             return Change(watch.node_id, str(watch.before), str(now), False, why)
-        since_ns = time.monotonic_ns()
+        since_ns = clock.monotonic_ns()
         connection.wait_until(lambda: False, _GUARD_EACH_S)
 
 
@@ -122,7 +122,7 @@ def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
         now = connection.listener.newest_beat(node_id, sent_ns)
         after = "silent" if now is None else state_name(now.state)
         return Change(node_id, str(watch.before), after, False, why)
-    booted_ns = time.monotonic_ns()
+    booted_ns = clock.monotonic_ns()
     heartbeat_s = connection.heartbeat_s(node_id)  # the reset may have changed the heartbeat period
     guarding = not connection.guarded(node_id)
     now_in = connection.state(node_id, heartbeat_s, guarding=guarding, since_ns=booted_ns)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -12,6 +11,7 @@ import numpy as np
 
 from skinnode.canopen import indices as od
 from skinnode.diagnose.facts import ScanFacts
+from skinnode.process import clock
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
@@ -87,7 +87,7 @@ class ScanCapture:
             stated_noise: Relative noise of the patch's converter, according to the hand file.
         """
         patch = self._patches[node_id]
-        patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
+        patch.keep(patch.assembler.poll(clock.monotonic_ns()), self._sync_ns)
         scans = list(patch.scans)
         if not scans:
             return None

@@ -8,7 +8,6 @@ program therefore reads the baseline back only when the node's SDO channel is id
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -25,6 +24,7 @@ from skinnode.errors import BusError, NodeError, SdoAbort
 from skinnode.host.sdo_client import RemoteOd
 from skinnode.model.baseline_change import touched_crossings
 from skinnode.model.layout import Float
+from skinnode.process import clock
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
@@ -174,10 +174,10 @@ def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: f
 
     Unless another client starts a transfer, the wait lasts at least ``at_least_s``.
     """
-    begun_s = quiet_s = time.monotonic()
+    begun_s = quiet_s = clock.monotonic()
     request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)
     count, heard = -1, False
-    while (now_s := time.monotonic()) - begun_s < OTHERS_S:
+    while (now_s := clock.monotonic()) - begun_s < OTHERS_S:
         counted = connection.listener.cob_ids[request] + connection.listener.cob_ids[response]
         if counted != count:
             heard, count, quiet_s = count >= 0, counted, now_s

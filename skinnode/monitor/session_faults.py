@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -14,6 +13,7 @@ from skinnode.host.trust_report import fault_table
 from skinnode.monitor.source import Source
 from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 SETTLE_NS: Final = 3_000_000_000
@@ -108,16 +108,16 @@ def watch(
     Raises:
         SkinError: If the source has failed.
     """
-    begun_s = due_s = time.monotonic()
+    begun_s = due_s = clock.monotonic()
     due_s += LINE_S
     history = History(source.hand, live=source.live)
     ending, pending = False, list[str]()
     while not ending:
         ending = stop.wait(LOOK_S) or source.over
-        now_s = time.monotonic()
+        now_s = clock.monotonic()
         ending |= seconds is not None and now_s >= begun_s + seconds
         view = history.add(source.snapshot())
-        faults.update(view, time.monotonic_ns(), ending=ending)
+        faults.update(view, clock.monotonic_ns(), ending=ending)
         pending += [str(event) for event in source.events()]
         if ending or now_s >= due_s:
             due_s += LINE_S

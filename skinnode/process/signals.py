@@ -6,8 +6,10 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from queue import Empty, SimpleQueue
+from queue import Empty
 from types import FrameType
+
+from skinnode.process import clock
 
 
 class SignalEvent(threading.Event):
@@ -20,7 +22,7 @@ class SignalEvent(threading.Event):
     def __init__(self) -> None:
         super().__init__()
         self._is_set = False
-        self._wake: SimpleQueue[None] = SimpleQueue()
+        self._wake = clock.simple_queue()
 
     def is_set(self) -> bool:
         """Return whether the event has been set."""

@@ -6,7 +6,6 @@ import io
 import os
 import random
 import tracemalloc
-import uuid
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +19,7 @@ from skinnode.files.input_file import read_input
 from skinnode.protocol.eds_files import eds_text
 from skinnode.protocol.profile import PatchProfile
 from skinnode.record.journal import read_journal
+from tests.commands import virtual_time
 from vcan_sim.cli import main as simulate
 
 EDS = (
@@ -115,7 +115,8 @@ def bad(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return [*CONTENTS, *others]
 
 
-BUS = ["--interface", "virtual", "--channel", uuid.uuid4().hex]
+CHANNEL = "nobody"
+BUS = ["--interface", "timed", "--channel", CHANNEL]
 NODE = ["node", "--source", "simulated", "--node-id", "4", *BUS, "--seconds", "0"]
 OPTIONS: dict[str, Callable[[str], list[str]]] = {
     "hand check": lambda file: ["hand", "check", file],
@@ -144,7 +145,7 @@ def test_a_file_that_is_none_is_one_line(
 ) -> None:
     for file in bad:
         arguments = OPTIONS[option](file)
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as ended, virtual_time(CHANNEL):
             (simulate if option == "vcan-sim" else main)(arguments[option == "vcan-sim" :])
         told = capsys.readouterr()
         assert (ended.value.code, told.out) == (2, ""), file
@@ -200,7 +201,7 @@ def test_a_mistake_in_an_eds_is_named_by_its_line(
     )
     commands = [["hand", "check", "hand.toml"], ["od", "5", *BUS, "--diff", "x.eds"]]
     for command in commands[: 1 if right in OF_ONE_READER else 2]:
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as ended, virtual_time(CHANNEL):
             main(command)
         (line,) = capsys.readouterr().err.splitlines()
         assert ended.value.code == 2
@@ -263,7 +264,7 @@ def test_a_small_file_that_needs_much_memory_is_refused_before(
     option = ["od", "5", *BUS, "--diff", name] if name.endswith(".eds") else ["eds", "--layout", f"./{name}"]
     tracemalloc.start()
     try:
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as ended, virtual_time(CHANNEL):
             main(option)
         _, most = tracemalloc.get_traced_memory()
     finally:

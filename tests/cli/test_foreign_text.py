@@ -22,6 +22,7 @@ from skinnode.node import NodeRunner, PatchNode, VolatileMemory
 from skinnode.text.printable import PrintableStream, printable
 from skinnode.transport import CanPort
 from vcan_sim.cli import main as simulate
+from vcan_sim.virtual_time import VirtualClock
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\x9b31m<script>alert(1)</script>[bold]:bomb:\r\nforged: \x7f"
 """As latin-1, which a device name is."""
@@ -105,13 +106,14 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     monkeypatch.chdir(tmp_path)
     layout = PatchLayout.preset("staggered", **LAYOUT)
     ohm = resistance_ohm(layout, layout.upper_m)
-    bus = BusConfig(name="can7", interface="virtual", channel=uuid.uuid4().hex)
+    bus = BusConfig(name="can7", interface="timed", channel=uuid.uuid4().hex)
 
     class Rest:
         def read(self, t_ns: int) -> object:
             return ohm
 
     with ExitStack() as stack:
+        stack.enter_context(VirtualClock())
         port = stack.enter_context(CanPort(bus))
         with monkeypatch.context() as named:
             named.setattr(od, "DEVICE_NAME", EVIL.encode("latin-1"))

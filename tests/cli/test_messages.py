@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from skinnode.cli.scan import _faults
 from skinnode.config import load_hand
 from skinnode.diagnose.discovery import Discovery, FoundNode
 from skinnode.errors import ConfigError
+from tests.commands import virtual_time
 from vcan_sim.cli import app as simulator
 from vcan_sim.fleet import Fleet
 
@@ -52,24 +52,25 @@ def check(text: str) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working directory with hand files: of one bus, of two, one that is wrong, and other files."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A working directory with hand files: of one bus, of two, one that is wrong, and other files.
+
+    Time is virtual, because most commands wait for devices that are not there."""
     monkeypatch.chdir(tmp_path)
-    buses = [
-        f'[[buses]]\nname = "b{i}"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n' for i in (0, 1)
-    ]
+    buses = [f'[[buses]]\nname = "b{i}"\ninterface = "timed"\nchannel = "b{i}"\n' for i in (0, 1)]
     patch = '[[patches]]\nname = "{0}"\nnode_id = {1}\nbus = "{2}"\nlayout = {{ {3} }}\n'
     palm, thumb = patch.format("palm", 5, "b0", SMALL), patch.format("thumb", 5, "b1", SMALL)
     head = "[sync]\nperiod_ms = 50\n"
     (tmp_path / "one.toml").write_text(head + buses[0] + palm)
     (tmp_path / "two.toml").write_text("".join((head, *buses, palm, thumb)))
     (tmp_path / "wrong.toml").write_text(head + buses[0] + palm.replace("node_id = 5", "node_id = 500"))
-    (tmp_path / "spelt.toml").write_text(head + buses[0].replace("virtual", "vertual") + palm)
+    (tmp_path / "spelt.toml").write_text(head + buses[0].replace("timed", "vertual") + palm)
     (tmp_path / "text").write_text("no hand, no recording, no EDS\n")
-    return tmp_path
+    with virtual_time("b0", "b1", "nobody"):
+        yield tmp_path
 
 
-ON = "--interface virtual --channel nobody"
+ON = "--interface timed --channel nobody"
 NOBODY_THERE = [
     f"info 5 {ON}",
     f"info 0 {ON}",
@@ -86,7 +87,7 @@ NOBODY_THERE = [
     "info 5 --hand one.toml --fd",
     "info 5 --hand two.toml --channel x",
     "info 5 --interface vertual",
-    "info 5 --eds text --interface virtual",
+    "info 5 --eds text --interface timed",
     f"od 5 {ON}",
     f"od 5 10 --write 3 {ON}",
     f"od 5 --write 3 {ON}",

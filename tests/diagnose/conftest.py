@@ -18,9 +18,30 @@ from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode, VolatileMemory
+from skinnode.process import clock
 from skinnode.transport import CanPort
+from tests.conftest import BETWEEN_PROCESSES, bus_on
+from vcan_sim.virtual_time import VirtualClock
 
+TIMED = "timed"
 LAYOUT = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=6, lower_electrodes=2)
+
+
+@pytest.fixture(autouse=True)
+def virtual_time(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Run the test in virtual time, unless code that knows only the system's clock takes part in it."""
+    marked = any(request.node.get_closest_marker(name) for name in ("system_time", "vcan"))
+    parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
+    if marked or parameters.get("any_bus", TIMED) != TIMED:
+        yield
+        return
+    with VirtualClock():
+        yield
+
+
+def interface_in_this_time() -> str:
+    """The interface of a bus within this process."""
+    return TIMED if isinstance(clock.current(), VirtualClock) else "virtual"
 
 
 class Rest:
@@ -56,8 +77,14 @@ def boards(bus: BusConfig, *node_ids: int, **options: Any) -> Iterator[list[Patc
 
 @pytest.fixture
 def bus() -> BusConfig:
-    """A virtual bus of its own."""
-    return BusConfig(name="can7", interface="virtual", channel=uuid.uuid4().hex)
+    """A bus of its own."""
+    return BusConfig(name="can7", interface=interface_in_this_time(), channel=uuid.uuid4().hex)
+
+
+@pytest.fixture(params=[TIMED, *BETWEEN_PROCESSES])
+def any_bus(request: pytest.FixtureRequest, multicast_group: str) -> BusConfig:
+    """Each interface that a test can have to itself."""
+    return bus_on(request.param, multicast_group)
 
 
 @pytest.fixture
@@ -106,13 +133,14 @@ SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_elec
 
 @pytest.fixture
 def hand_file(tmp_path: Path) -> Callable[..., Path]:
-    """A hand of two small patches on a virtual bus of its own; ``first`` are further lines of the first."""
+    """A hand of two small patches on a bus of its own; ``first`` are further lines of the first."""
 
     def make(first: str = "", layout: str = "staggered") -> Path:
         sizes = ", ".join(f"{key} = {value}" for key, value in SMALL.items())
         file = tmp_path / f"{uuid.uuid4().hex}.toml"
         file.write_text(
-            f'[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
+            f'[[buses]]\nname = "can0"\ninterface = "{interface_in_this_time()}"\n'
+            f'channel = "{uuid.uuid4().hex}"\n'
             "[sync]\nperiod_ms = 50\n"
             f'[[patches]]\nname = "thumb"\nnode_id = 5\nrelative_noise = 1e-4\n{first}\n'
             f'layout = {{ preset = "{layout}", {sizes} }}\n'

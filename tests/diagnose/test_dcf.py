@@ -176,6 +176,7 @@ def talker(bus: BusConfig, tmp_path: Path) -> Iterator[tuple[canopen.LocalNode, 
         network.disconnect()
 
 
+@pytest.mark.system_time  # threads of the canopen library
 @pytest.mark.parametrize("data", [b"caf\xc3\xa9", b"a\tb\x01\x7f", b"plain", b"padded\0\0"])
 def test_a_node_is_as_its_dcf_says(
     bus: BusConfig, talker: tuple[canopen.LocalNode, Path], tmp_path: Path, data: bytes
@@ -196,6 +197,7 @@ def test_a_node_is_as_its_dcf_says(
 ALIKE = [b"", b"abc", b"abc\0", b"abc ", b" abc", b"0", b"a\x1b", b"a\\x1b", b"x" * 300, b"x" * 299 + b"y"]
 
 
+@pytest.mark.system_time  # threads of the canopen library
 @pytest.mark.parametrize("data_type", sorted(STRINGS))
 def test_strings_that_look_alike_differ_visibly(
     bus: BusConfig, talker: tuple[canopen.LocalNode, Path], tmp_path: Path, data_type: int
@@ -219,6 +221,7 @@ def test_strings_that_look_alike_differ_visibly(
                 assert "" != found["node"] != found["file"] != "", (data, other)
 
 
+@pytest.mark.system_time  # threads of the canopen library
 def test_an_empty_string_is_no_default(
     bus: BusConfig, talker: tuple[canopen.LocalNode, Path], tmp_path: Path
 ) -> None:
@@ -254,6 +257,7 @@ def encoded(encoding: str) -> bytes:
     return bom + plain.replace(b"NAME", name.removeprefix(b"\xef\xbb\xbf"))
 
 
+@pytest.mark.system_time  # threads of the canopen library
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_encoding_of_a_sheet_is_found_and_told(
     bus: BusConfig, talker: tuple[canopen.LocalNode, Path], encoding: str
@@ -267,6 +271,7 @@ def test_the_encoding_of_a_sheet_is_found_and_told(
     assert done.stderr == note
 
 
+@pytest.mark.system_time  # threads of the canopen library
 @pytest.mark.parametrize("encoding", [name for name in ENCODINGS if not name.startswith("UTF-16")])
 def test_a_default_is_compared_by_the_bytes_of_the_file(
     bus: BusConfig, talker: tuple[canopen.LocalNode, Path], tmp_path: Path, encoding: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from skinnode.diagnose.bus_listener import Emergency
 from skinnode.diagnose.facts import BusFacts, PatchFacts, Sure
 from skinnode.diagnose.root_causes import grouped, merged
 from skinnode.host import Host
+from skinnode.process import clock
 from skinnode.transport import CanPort
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
@@ -135,7 +135,7 @@ def test_a_host_of_the_hand_is_neither_somebody_nor_unknown(
     fleet.inject(Faults(unplugged=True), "index")
     port = on(CanPort(hand.buses[0]))
     port.send(od.NMT_COB_ID, bytes((128, 5)))  # the host starts it again
-    time.sleep(0.8)
+    clock.sleep(0.8)
     done = run(["doctor", file, "--json"])
     told = {row["what"] for row in done.json["findings"]}
     assert "the node is missing" in told

@@ -18,6 +18,8 @@ from skinnode.diagnose.standard_objects import standard_entries
 
 from .conftest import run
 
+pytestmark = pytest.mark.system_time  # threads of the canopen library
+
 NODE_ID = 16
 _SECTIONS = {
     "1000": ("Device type", "0x7", "ro", "0x000F0191"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,6 +18,7 @@ from skinnode.diagnose.node_info import read_info
 from skinnode.errors import SdoAbort
 from skinnode.host.sdo_client import RemoteOd
 from skinnode.node import PatchNode
+from skinnode.process import clock
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 
@@ -163,7 +163,7 @@ def test_nobody_there_or_no_node_id(bus: BusConfig) -> None:
 @contextmanager
 def _babbler(bus: BusConfig, node_id: int, answer: Callable[[bytes], bytes]) -> Iterator[None]:
     """A node that sends heartbeats, and ``answer`` of each SDO request."""
-    over = threading.Event()
+    over = clock.event()
 
     def babble(port: CanPort) -> None:
         while not over.is_set():
@@ -175,7 +175,7 @@ def _babbler(bus: BusConfig, node_id: int, answer: Callable[[bytes], bytes]) -> 
                 frame = port.recv(0.05)
 
     with CanPort(bus) as port:
-        thread = threading.Thread(target=babble, args=(port,))
+        thread = clock.thread(babble, "babbler", (port,))
         thread.start()
         try:
             yield

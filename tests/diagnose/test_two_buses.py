@@ -12,7 +12,7 @@ import pytest
 from skinnode.config import load_hand
 from vcan_sim.fleet import Fleet
 
-from .conftest import SMALL, run
+from .conftest import SMALL, interface_in_this_time, run
 
 
 @pytest.fixture
@@ -21,7 +21,8 @@ def two_buses(tmp_path: Path, on: Callable[[Any], Any]) -> Path:
     sizes = ", ".join(f"{key} = {value}" for key, value in SMALL.items())
     text = "[sync]\nperiod_ms = 50\n"
     for bus in ("left", "right"):
-        text += f'[[buses]]\nname = "{bus}"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
+        text += f'[[buses]]\nname = "{bus}"\ninterface = "{interface_in_this_time()}"\n'
+        text += f'channel = "{uuid.uuid4().hex}"\n'
     for name, bus, node_id in (("palm", "left", 5), ("thumb", "right", 5), ("index", "right", 6)):
         text += f'[[patches]]\nname = "{name}"\nbus = "{bus}"\n'
         text += f"node_id = {node_id}\nserial = {node_id}{len(name)}\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,6 +16,7 @@ from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
+from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.record.convert import convert
 from skinnode.record.replay import Replay
@@ -24,6 +24,7 @@ from skinnode.remote.description import Description
 from skinnode.resolve.recording import recording_at
 from skinnode.resolve.settings import apply, variants
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 from .test_replay import a_hand, key
 
@@ -40,8 +41,8 @@ def with_layout_file(folder: Path) -> HandConfig:
 
 
 def taken(host: Host, seconds: float) -> Iterator[FieldFrame]:
-    fields, end_s = host.fields(capacity=1000), time.monotonic() + seconds
-    while time.monotonic() < end_s:
+    fields, end_s = host.fields(capacity=1000), clock.monotonic() + seconds
+    while clock.monotonic() < end_s:
         field = fields.get(0.1)
         if field is not None:
             yield field
@@ -54,7 +55,12 @@ Recorded = tuple[Path, dict[tuple[str, int], bytes]]
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("files")
     hand, path = with_layout_file(folder), folder / "run.log"
-    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+    with (
+        VirtualClock(),
+        Fleet(hand),
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
         live = {key(field): field.displacement_m.tobytes() for field in taken(host, 1.5)}
     assert recorder.stats().failure is None
     assert {patch for patch, _ in live} == {"p0", "p1"}
@@ -118,7 +124,7 @@ def test_the_layout_file_can_be_given_later(recorded: Recorded, tmp_path: Path) 
 
 def test_a_file_that_changes_during_a_run_does_not_change_the_recording(tmp_path: Path) -> None:
     hand, path = with_layout_file(tmp_path), tmp_path / "run.log"
-    with Fleet(hand), Recorder(hand, path) as recorder:
+    with VirtualClock(), Fleet(hand), Recorder(hand, path) as recorder:
         other = PatchLayout.preset("staggered", upper_wires=3, upper_electrodes=4)
         with Host.from_config(hand, tap=recorder) as host:
             np.savez(tmp_path / FILE, upper_m=other.upper_m, lower_m=other.lower_m)
@@ -161,10 +167,11 @@ def test_the_recording_of_a_guest_that_sends_nothing_is_replayed(tmp_path: Path)
     table = a_hand().model_dump(mode="json", exclude_defaults=True) | {"sync": {"period_ms": 80}}
     hand = parse_hand(table)
     with ExitStack() as stack:
+        stack.enter_context(VirtualClock())
         stack.enter_context(Fleet(hand))
         recorder = stack.enter_context(Recorder(hand, tmp_path / "master.log"))
         stack.enter_context(Host.from_config(hand, tap=recorder))
-        time.sleep(0.5)
+        clock.sleep(0.5)
         guest = guest_of(hand, tmp_path / "master.jsonl", 80)
         own = stack.enter_context(Recorder(guest, tmp_path / "guest.log"))
         with Host.from_config(guest, tap=own) as host:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,11 @@ from skinnode.config import HandConfig, SyncConfig, load_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.record.convert import convert
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 from .test_replay import a_hand
 
@@ -38,17 +39,21 @@ tolerances = "exact"
 """
 
 
+def record(path: Path, hand: HandConfig, seconds: float) -> Path:
+    """Record a hand in virtual time."""
+    with VirtualClock(), Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
+        clock.sleep(seconds)
+    assert recorder.stats().failure is None
+    return path
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording in which the host solved every scan; on a busy machine it may skip some."""
-    for _ in range(5):
-        hand, path = a_hand(), tmp_path_factory.mktemp("foreign") / "run.log"
-        with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
-            time.sleep(1.5)
-        assert recorder.stats().failure is None
-        journal = path.with_suffix(".jsonl").read_text()
-        if "overtaken" not in journal and "polled" not in journal:
-            break
+    """A recording in which the host solved every scan."""
+    path = record(tmp_path_factory.mktemp("foreign") / "run.log", a_hand(), 1.5)
+    journal = path.with_suffix(".jsonl").read_text()
+    assert "overtaken" not in journal
+    assert "polled" not in journal
     return path
 
 
@@ -109,9 +114,7 @@ def test_with_the_baselines_it_gives_the_fields_of_the_host(
 def test_a_sync_missing_from_the_log_changes_no_scan_number(tmp_path: Path) -> None:
     """Its counter was that of a SYNC one round before."""
     sync = SyncConfig(period_ms=25, counter_overflow=8)
-    path, hand = tmp_path / "run.log", a_hand().model_copy(update={"sync": sync})
-    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
-        time.sleep(0.8)
+    path = record(tmp_path / "run.log", a_hand().model_copy(update={"sync": sync}), 0.8)
     log, own = foreign(path, tmp_path), hand_file(tmp_path).model_copy(update={"sync": sync})
     whole = [field.stamp for field in replay(log, hand=own)]
     lines = log.read_text().splitlines(keepends=True)
@@ -184,11 +187,16 @@ def test_a_node_that_restarts_is_decoded_again(recorded: Path, tmp_path: Path) -
 def test_a_new_baseline_is_not_guessed(tmp_path: Path) -> None:
     """p0 is tared; a log does not contain its new baseline. p1 goes on."""
     hand, path = a_hand(), tmp_path / "run.log"
-    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
-        time.sleep(0.5)
+    with (
+        VirtualClock(),
+        Fleet(hand),
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
+        clock.sleep(0.5)
         host.tare("p0")
-        tared_ns = time.time_ns()
-        time.sleep(0.7)
+        tared_ns = clock.time_ns()
+        clock.sleep(0.7)
     run = replay(foreign(path, tmp_path), hand=hand_file(tmp_path, path))
     last_ns = dict.fromkeys(("p0", "p1"), 0)
     for field in run:

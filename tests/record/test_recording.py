@@ -23,10 +23,13 @@ from skinnode.errors import BusError, ConfigError
 from skinnode.host import Host
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.transport import CanPort
+from tests.conftest import BETWEEN_PROCESSES, bus_on
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 from .test_replay import SMALL, key
 
@@ -50,9 +53,9 @@ class Run:
     def take(self, fields: int, patch: str = "p0") -> None:
         """Wait for that many more of ``patch``."""
         wanted = self._count(patch) + fields
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = clock.monotonic() + PATIENCE_S
         while self._count(patch) < wanted:
-            assert time.monotonic() < end_s
+            assert clock.monotonic() < end_s
             field = self._fields.get(0.05)
             if field is not None:
                 self.live[key(field)] = field
@@ -65,10 +68,22 @@ class Run:
         return sum(name == patch for name, _ in self.live)
 
 
+@pytest.fixture(params=["timed", *BETWEEN_PROCESSES])
+def recorded_bus(request: pytest.FixtureRequest, multicast_group: str) -> BusConfig:
+    """A bus in virtual time, and each interface that crosses processes."""
+    return bus_on(request.param, multicast_group)
+
+
+def time_of(bus: BusConfig) -> contextlib.AbstractContextManager[object]:
+    """The time in which a bus runs."""
+    return VirtualClock() if bus.interface == "timed" else contextlib.nullcontext()
+
+
 @contextlib.contextmanager
 def recorded(bus: BusConfig, path: Path) -> Iterator[Run]:
     hand = hand_on(bus)
     with (
+        time_of(bus),
         Fleet(hand) as fleet,
         Recorder(hand, path) as recorder,
         Host.from_config(hand, tap=recorder) as host,
@@ -93,10 +108,12 @@ def assert_same(path: Path, live: dict[tuple[str, int], FieldFrame]) -> None:
         assert other.status == field.status
 
 
-def test_a_run_with_faults_is_the_same_again_on_every_interface(any_bus: BusConfig, tmp_path: Path) -> None:
+def test_a_run_with_faults_is_the_same_again_on_every_interface(
+    recorded_bus: BusConfig, tmp_path: Path
+) -> None:
     """Chunks that get lost, a scan cut off by a reset, a node that is unplugged and comes back."""
     path = tmp_path / "run.log"
-    with recorded(any_bus, path) as run:
+    with recorded(recorded_bus, path) as run:
         run.take(10)
         for faults in (Faults(lost=0.05, late=0.05, reordered=0.05), Faults(reset=1.0)):
             run.fleet.inject(faults, "p0")
@@ -157,7 +174,7 @@ def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     """The counter wraps after 4, so it tells nothing about the 12 periods or more of an outage."""
-    bus = BusConfig(name="can0", interface="virtual", channel=tmp_path.name)
+    bus = BusConfig(name="can0", interface="timed", channel=tmp_path.name)
     hand = hand_on(bus)
     hand = hand.model_copy(update={"sync": SyncConfig(period_ms=25, counter_overflow=4)})
     away, send = threading.Event(), CanPort.send
@@ -170,6 +187,7 @@ def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent
     monkeypatch.setattr(CanPort, "send", refusing)
     path = tmp_path / f"run{suffix}"
     with (
+        VirtualClock(),
         Fleet(hand) as fleet,
         Recorder(hand, path) as recorder,
         Host.from_config(hand, tap=recorder) as host,
@@ -179,9 +197,9 @@ def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent
         before = max(scan for _, scan in run.live)
         away.set()
         failed = host.stats().sync.failed
-        end_s = time.monotonic() + PATIENCE_S
-        while host.stats().sync.failed < failed + 13 and time.monotonic() < end_s:
-            time.sleep(0.01)
+        end_s = clock.monotonic() + PATIENCE_S
+        while host.stats().sync.failed < failed + 13 and clock.monotonic() < end_s:
+            clock.sleep(0.01)
         away.clear()
         run.take(10)
         run.collect()
@@ -197,7 +215,7 @@ def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent
 @pytest.mark.parametrize("jump_s", [3600.0, -3600.0, 0.5])
 def test_times_in_a_recording_that_jump(tmp_path: Path, jump_s: float) -> None:
     """A clock that was set by whoever wrote the log: the scan it falls into is lost, nobody waits an hour."""
-    bus = BusConfig(name="can0", interface="virtual", channel=tmp_path.name + str(jump_s))
+    bus = BusConfig(name="can0", interface="timed", channel=tmp_path.name + str(jump_s))
     path = tmp_path / "run.log"
     with recorded(bus, path) as run:
         run.take(30)
@@ -337,16 +355,17 @@ def test_what_has_no_name_is_no_recording(name: str) -> None:
 
 
 def test_two_logs_of_one_name_in_a_folder_have_a_journal_each(tmp_path: Path) -> None:
-    hand = hand_on(BusConfig(interface="virtual", channel="two-logs"))
+    hand = hand_on(BusConfig(interface="timed", channel="two-logs"))
     live: dict[str, set[tuple[str, int]]] = {}
     for suffix in (".log", ".blf"):
         with (
+            VirtualClock(),
             Fleet(hand),
             Recorder(hand, tmp_path / f"run{suffix}") as recorder,
             Host.from_config(hand, tap=recorder) as host,
         ):
             fields = host.fields(capacity=1000)
-            time.sleep(0.4 if suffix == ".log" else 0.8)
+            clock.sleep(0.4 if suffix == ".log" else 0.8)
         live[suffix] = set()
         while (field := fields.get(0.0)) is not None:
             live[suffix].add(key(field))

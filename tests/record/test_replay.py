@@ -25,18 +25,21 @@ from skinnode.config import BringUpConfig, HandConfig, load_hand, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Condition, Host
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import FrameLog, LoggedFrame
 from skinnode.transport.frame_log_reader import FrameLogReader
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
 T_NS = 1_790_000_000_000_000_000
 
 
 def a_hand() -> HandConfig:
-    bus = {"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}
+    """A hand of two patches on a bus of its own in virtual time."""
+    bus = {"name": "can0", "interface": "timed", "channel": uuid.uuid4().hex[:8]}
     patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL, "tolerances": "exact"} for i in range(2)]
     return parse_hand({"buses": [bus], "patches": patches, "sync": {"period_ms": 25}})
 
@@ -57,10 +60,15 @@ def test_a_replay_gives_the_bits_of_the_live_run(
     hand, path = a_hand(), tmp_path / f"run{suffix}"
     live: dict[tuple[str, int], FieldFrame] = {}
     fleet = Fleet(hand, unchecked=unchecked)
-    with fleet, Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+    with (
+        VirtualClock(),
+        fleet,
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
         fields = host.fields(capacity=1000)
-        end_s = time.monotonic() + 2.0
-        while time.monotonic() < end_s:
+        end_s = clock.monotonic() + 2.0
+        while clock.monotonic() < end_s:
             field = fields.get(0.1)
             if field is not None:
                 live[key(field)] = field
@@ -101,15 +109,20 @@ def test_health_follows_the_heartbeat_period_of_the_nodes(tmp_path: Path) -> Non
     """A guest keeps the period that the bus's master has set, whatever its hand file says."""
     hand, path = a_hand(), tmp_path / "run.log"
     slow = hand.model_copy(update={"bring_up": BringUpConfig(heartbeat_ms=1000)})
-    with Fleet(slow), Recorder(slow, path) as recorder, Host.from_config(slow, tap=recorder):
-        time.sleep(2.5)
+    with (
+        VirtualClock(),
+        Fleet(slow),
+        Recorder(slow, path) as recorder,
+        Host.from_config(slow, tap=recorder),
+    ):
+        clock.sleep(2.5)
     first, *events = path.with_suffix(".jsonl").read_text().splitlines(keepends=True)
     header = json.loads(first)
     assert header["hand"].pop("bring_up") == {"heartbeat_ms": 1000}
     path.with_suffix(".jsonl").write_text("".join([json.dumps(header), "\n", *events]))
     run = replay(path)
     conditions = [run.health(field.stamp.patch).condition for field in run if field.stamp is not None]
-    assert len(conditions) > 5  # a hundred, unless the machine is busy
+    assert len(conditions) > 100
     assert Condition.LOST not in conditions
 
 
@@ -316,7 +329,12 @@ def test_contacts_and_forces_are_in_the_json_of_host_and_replay(tmp_path: Path) 
 def test_contacts_are_unknown_before_the_first_field_and_none_if_nothing_touches(tmp_path: Path) -> None:
     assert contact_tables(None) is None
     hand, path = a_hand(), tmp_path / "run.log"
-    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+    with (
+        VirtualClock(),
+        Fleet(hand),
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
         field = host.fields().get(5.0)
     assert field is not None
     assert field.method == "exact"

@@ -18,8 +18,10 @@ import pytest
 from skinnode.cli._errors import run
 from skinnode.cli.main import app
 from skinnode.host import Condition, Host
+from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 from .test_replay import a_hand
 
@@ -37,17 +39,20 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    for _ in range(10):  # a machine that stands still for a period costs a scan, which is then missing here
-        hand, path = a_hand(), tmp_path_factory.mktemp("whole") / "run.log"
-        with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
-            end_s = time.monotonic() + 60.0
-            while min(each.assembler.scans_complete for each in host.stats().patches.values()) < 40:
-                assert time.monotonic() < end_s
-                time.sleep(0.05)
-            streams = [stream.assembler for stream in host.stats().patches.values()]
-        assert recorder.stats().dropped == 0
-        if not any(stream.scans_missed or stream.scans_torn for stream in streams):
-            break
+    hand, path = a_hand(), tmp_path_factory.mktemp("whole") / "run.log"
+    with (
+        VirtualClock(),
+        Fleet(hand),
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
+        end_s = clock.monotonic() + 60.0
+        while min(each.assembler.scans_complete for each in host.stats().patches.values()) < 40:
+            assert clock.monotonic() < end_s
+            clock.sleep(0.05)
+        streams = [stream.assembler for stream in host.stats().patches.values()]
+    assert recorder.stats().dropped == 0
+    assert not any(stream.scans_missed or stream.scans_torn for stream in streams)
     journal = path.with_suffix(".jsonl").read_text().splitlines()
     return Recorded(path.read_bytes().splitlines(keepends=True), [json.loads(line) for line in journal])
 

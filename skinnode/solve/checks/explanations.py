@@ -25,7 +25,6 @@ from skinnode.solve.checks.crossed_wires import WirePair, exchanged, likeliest
 from skinnode.solve.checks.greedy_search import CROSSING, LOAD, LOWER, UPPER, GreedySearch, crossing_gain
 from skinnode.solve.checks.reading_model import Level, ReadingModel, evidences
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least_fitting
-from skinnode.solve.linalg.cholesky import multiply_vector
 
 MARGIN: Final = 40.0
 """Minimum margin for reporting a fault, in nats. The margin is the log evidence with faults minus the log
@@ -84,7 +83,7 @@ class Explainer:
     def __init__(self, model: ReadingModel) -> None:
         self._model = model
         self._search = GreedySearch(model)
-        self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
+        self._row = np.empty(max(model.shape) + 1)
         self.margin = -math.inf
         """Margin of the last frame, in nats: log evidence with faults minus log evidence with loads or more
         noise."""
@@ -119,25 +118,24 @@ class Explainer:
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
         with_faults = not whole_wires_only
-        for number in _scales(best):
+        products = self._search.products(z, _scales(best))
+        for number, of_scale in zip(_scales(best), products, strict=True):
             start = float(evidence[number])
-            loads = start + self._search.run(number, z, present, cost, faults=False)
+            loads = start + self._search.run(number, z, of_scale, present, cost, faults=False)
             by_loads = max(by_loads, loads)
             if with_faults:
-                total = start + self._search.run(number, z, present, cost, faults=True)
+                total = start + self._search.run(number, z, of_scale, present, cost, faults=True)
                 if total > by_faults:
                     by_faults, groups = total, self._groups()
                 with_faults = total > loads - HOPELESS
         self.is_noisier = noisier > by_loads + DOUBT
         by_loads = max(by_loads, noisier)
-        level = self._model.level(best)
-        multiply_vector(level.precision, z.ravel(), self._alpha)
-        alpha = self._alpha.copy()
+        level, alpha = self._model.level(best), products[0, : z.size].copy()
         if not whole_wires_only:
             by_pair, pair = self._by_exchange(z, present, cost, alpha, level)
             if by_pair > by_faults:
                 by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
-            by_reading, number = self._by_reading(z, present, evidence, best, cost)
+            by_reading, number = self._by_reading(z, products, present, evidence, best, cost)
             # A narrow load at the edge of a patch looks like a wrong reading. A smaller margin is therefore
             # no reason to doubt the frame.
             if by_reading > max(by_faults, by_loads + MARGIN_OF_READING):
@@ -162,36 +160,34 @@ class Explainer:
         """
         most = -math.inf
         groups: tuple[Group, ...] = ()
-        for number in range(best, -1, -STRIDE):
+        scales = range(best, -1, -STRIDE)
+        for number, of_scale in zip(scales, self._search.products(z, scales), strict=True):
             total = float(evidence[number])
-            total += self._search.run(number, z, present, cost, faults=True, loads=False)
+            total += self._search.run(number, z, of_scale, present, cost, faults=True, loads=False)
             if total > most:
                 most, groups = total, self._groups()
         return groups
 
-    def _by_reading(
-        self, z: Float, present: Mask, evidence: Float, best: int, cost: float
+    def _by_reading(  # noqa: PLR0913 - the frame, and what is known of it
+        self, z: Float, products: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[float, int]:
         """Return the highest log evidence for loads and one wrong reading, and the index of this reading.
 
         A single reading needs its own search. At small prior scales, the greedy search would first leave out
         the whole wire of this reading.
         """
-        level = self._model.level(best)
-        multiply_vector(level.precision, z.ravel(), self._alpha)
-        gain, number = crossing_gain(level.diagonal, self._alpha, present.ravel(), cost)
+        alphas = np.ascontiguousarray(products[:, : z.size])
+        gain, number = crossing_gain(self._model.diagonals[best], alphas[0], present.ravel(), cost)
         most = -math.inf
         if gain < DOUBT:
             return most, number
         without = present.copy()
         without.ravel()[number] = False
-        for scale in _scales(best):
-            level = self._model.level(scale)
-            d = max(float(level.precision[number, number]), LEAST)
-            alpha = float(level.precision[number] @ z.ravel())
+        for scale, of_scale, alpha in zip(_scales(best), products, alphas[:, number].tolist(), strict=True):
+            d = max(float(self._model.diagonals[scale, number]), LEAST)
             gain = 0.5 * alpha * alpha / d - 0.5 * math.log(d) - cost - math.log(z.size)
-            total = float(evidence[scale]) + gain + self._search.run(scale, z, without, cost, faults=False)
-            most = max(most, total)
+            gain += self._search.run(scale, z, of_scale, without, cost, faults=False)
+            most = max(most, float(evidence[scale]) + gain)
         return most, number
 
     def _reading(self, number: int, gain: float) -> Group:
@@ -249,8 +245,8 @@ class Explainer:
         return max(
             float(evidence[number])
             + extra(model.level(number))
-            + self._search.run(number, z, present, cost, faults=False)
-            for number in _scales(best)
+            + self._search.run(number, z, of_scale, present, cost, faults=False)
+            for number, of_scale in zip(_scales(best), self._search.products(z, _scales(best)), strict=True)
         )
 
     def _wire(self, wire: int, gain: float) -> Group:

@@ -11,6 +11,7 @@ all readings of a wire are wrong.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -20,7 +21,7 @@ from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
 from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.checks.wire_tests import LEAST
-from skinnode.solve.linalg.cholesky import cholesky, multiply_vector, solve_lower_vector
+from skinnode.solve.linalg.cholesky import cholesky, multiply, multiply_vector, solve_lower_vector
 from skinnode.solve.linalg.vectors import Index
 
 STEPS: Final = 8
@@ -31,6 +32,8 @@ loads each. With a maximum of 8, half of the healthy frames of a deep slide were
 3e-6)."""
 ENOUGH: Final = 1.0
 """Minimum gain in log evidence (nats) for adding a load or a group of wrong readings."""
+ROUNDING: Final = 1e-6
+"""Margin for rounding errors in the bound of a wire's gain, in nats."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
 """Kinds of search steps: add a load; leave out one reading; leave out all readings of a lower wire, or of an
 upper wire."""
@@ -57,14 +60,38 @@ class GreedySearch:
         self.kinds, self.numbers = np.full((2, LOADS), -1)
         self.gains = np.empty(LOADS)
 
+    def products(self, z: Float, numbers: Sequence[int]) -> Float:
+        """Return Aᵀ P z (n, m + 4Q) of a frame at several κ.
+
+        Args:
+            z: (U, K) changes in the readings since rest, in units of their noise.
+            numbers: Indices of the n values of κ.
+        """
+        model, (m, count) = self._model, self._model.response.shape
+        parts, by_readings = np.empty(m), np.empty((len(numbers), m))
+        by_loads = np.empty((len(numbers), count))
+        multiply_vector(model.vectors_t, z.ravel(), parts)
+        multiply(model.shrink[list(numbers)] * parts, model.vectors_t, by_readings)
+        multiply(by_readings, model.response, by_loads)
+        return np.concatenate([by_readings, by_loads], axis=1)
+
     def run(  # noqa: PLR0913 - the frame, and which explanations are allowed
-        self, number: int, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
+        self,
+        number: int,
+        z: Float,
+        products: Float,
+        present: Mask,
+        cost: float,
+        *,
+        faults: bool,
+        loads: bool = True,
     ) -> float:
         """Find the best explanation of a frame, store its steps as attributes and return its gain in nats.
 
         Args:
             number: Index of κ.
             z: (U, K) changes in the readings since rest, in units of their noise.
+            products: (m + 4Q,) Aᵀ P z at this κ, from :meth:`products`.
             present: (U, K) mask of the readings to use.
             cost: Log evidence subtracted for each wrong reading, in nats.
             faults: Whether the explanation may contain wrong readings.
@@ -73,14 +100,14 @@ class GreedySearch:
         self.kinds[:] = -1
         (m, count), (upper, lower) = self._model.response.shape, self._model.shape
         level, tables = self._model.level(number), self._model.loads(number)
-        weighted, diagonal = np.empty(m + count), tables.diagonal.copy()
+        weighted, diagonal = products.copy(), tables.diagonal.copy()
         vectors, share = np.empty((LOADS + m, m + count)), np.empty(LOADS + m)
         of_upper, of_lower = np.empty((upper, lower, lower)), np.empty((lower, upper, upper))
         block, right = np.empty((max(upper, lower),) * 2), np.empty(max(upper, lower))
         return _search(
             z.ravel(), present.ravel().copy(), upper, lower, cost, loads, faults,
             LEAST * float(tables.diagonal[m:].max()),
-            level.precision, tables.moved_t, tables.gram, self._model.response_t,
+            level.precision, tables.moved_t, tables.gram, self._model.response_t, level.wires.log_det_p,
             weighted, diagonal, vectors, share, of_upper, of_lower, block, right,
             self.kinds, self.numbers, self.gains,
         )  # fmt: skip
@@ -139,22 +166,31 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
     of_upper: Float,
     of_lower: Float,
     cost: float,
+    enough: float,
+    bound: float,
+    log_det_p: Float,
     block: Float,
     right: Float,
 ) -> tuple[float, int, int]:
     """Return the largest gain from treating a group of readings as wrong, and the group's kind and index.
 
     A group is a single reading or all readings of a wire. The gain of each group is reduced by ln n, where n
-    is the number of groups of its kind. ``block`` and ``right`` are work arrays.
+    is the number of groups of its kind. Groups whose gain cannot exceed ``enough`` may be ignored: the gain
+    of a wire is at most ``bound`` minus its element of ``log_det_p`` (U + K,) and minus the costs. ``block``
+    and ``right`` are work arrays.
     """
     upper, lower = len(of_upper), len(of_lower)
     gain, number = crossing_gain(d, alpha, present, cost)
     kind = CROSSING
     for k in range(lower):
+        if bound - log_det_p[upper + k] - cost * upper - math.log(lower) <= max(gain, enough):
+            continue
         value = _group_gain(of_lower[k], alpha, present, k, lower, cost, block, right) - math.log(lower)
         if value > gain:
             gain, kind, number = value, LOWER, k
     for u in range(upper):
+        if bound - log_det_p[u] - cost * lower - math.log(upper) <= max(gain, enough):
+            continue
         value = _group_gain(of_upper[u], alpha, present, u * lower, 1, cost, block, right) - math.log(upper)
         if value > gain:
             gain, kind, number = value, UPPER, u
@@ -290,6 +326,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     moved_t: Float,
     gram: Float,
     response_t: Float,
+    log_det_p: Float,
     weighted: Float,
     diagonal: Float,
     vectors: Float,
@@ -302,13 +339,18 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     numbers: Index,
     gains: Float,
 ) -> float:
-    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain in nats."""
+    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain in nats.
+
+    While all readings are in use, the gain of a wire is bounded. χ² = zᵀ P z is at least α_Gᵀ P_GG⁻¹ α_G, and
+    a load with a gain of ½ (r − 1 − ln r) multiplies the determinant of any block P_GG by at least 1/r.
+    """
     m = z.size
-    multiply_vector(p, z, weighted[:m])
-    multiply_vector(response_t, weighted[:m], weighted[m:])
-    count = 0
+    count, bound = 0, 0.0
+    for i in range(m):
+        bound += 0.5 * z[i] * weighted[i]
     for i in range(m):
         if not present[i]:
+            bound = math.inf
             _update(i, count, 0, p, moved_t, gram, response_t, weighted, diagonal, vectors, share)
             count += 1
     if faults:
@@ -322,8 +364,9 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
             gain, number = _best_load(weighted, diagonal, m, least)
         if faults:
             by_fault, fault, which = _best_group(
-                diagonal, weighted, present, of_upper, of_lower, cost, block, right
-            )
+                diagonal, weighted, present, of_upper, of_lower, cost, gain if number >= 0 else -math.inf,
+                bound + ROUNDING, log_det_p, block, right,
+            )  # fmt: skip
             if by_fault > gain or number < 0:
                 gain, kind, number = by_fault, fault, which
         if gain < ENOUGH or number < 0:
@@ -331,16 +374,18 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
         total += gain
         kinds[step], numbers[step], gains[step] = kind, number, gain
         if kind == LOAD:
-            first = (
-                0 if faults else m
-            )  # the first m elements, for the readings, are needed only to find faults
+            # the first m elements, for the readings, are needed only to find faults
+            first, b = 0 if faults else m, weighted[m + number]
             _update(
                 m + number, count, first, p, moved_t, gram, response_t, weighted, diagonal, vectors, share
             )
             if faults:
                 _update_blocks(share[count], vectors[count], of_upper, of_lower)
+                h = vectors[count, m + number]
+                bound -= 0.5 * (share[count] * b * b + math.log(max(1.0 - share[count] * h, LEAST)))
             count += 1
             continue
+        bound = math.inf
         for i in range(m):
             chosen = (
                 (kind == CROSSING and i == number)

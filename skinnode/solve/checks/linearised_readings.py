@@ -99,7 +99,7 @@ class LinearisedReadings:
         self._numbers = np.empty(len(OFFSETS), np.int64)
         self._weights, self._alpha = np.empty((2, len(OFFSETS), self.z.size))
         self._row = np.empty(max(shape))
-        self.evidence, self._of_noise = np.empty((2, len(self.model.kappa)))
+        self.evidence = np.empty(len(self.model.kappa))
         self._all = np.ones(shape, bool)
         self.present: Mask = self._all
         self.sigma, self.best = 1.0, 0
@@ -188,11 +188,11 @@ class LinearisedReadings:
         If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
         ln(ratio) for each reading.
         """
-        model, z, scratch = self.model, self.z.ravel(), np.empty_like(self._c)
+        squares = -2.0 * self.evidence - self.model.log_det  # zᵀ P z at each κ
         most = -math.inf
         for ratio in NOISE_RATIOS:
-            best = evidences(model.vectors_t, model.shrink, model.log_det, z / ratio, scratch, self._of_noise)
-            most = max(most, float(self._of_noise[best]) - z.size * math.log(ratio))
+            of_ratio = -0.5 * (squares / ratio**2 + self.model.log_det)
+            most = max(most, float(of_ratio.max()) - self.z.size * math.log(ratio))
         return most - math.log(len(NOISE_RATIOS))
 
     def deviations(self, solved: Solved) -> tuple[Float, Mask]:

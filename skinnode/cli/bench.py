@@ -1,4 +1,4 @@
-"""``skinnode bench``: runs the benchmarks.
+"""``skinnode bench``: runs the benchmarks. Those of the solver are in this file.
 
 Ratios compare times from the same run, because absolute times depend on the machine.
 """
@@ -6,22 +6,16 @@ Ratios compare times from the same run, because absolute times depend on the mac
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
+from skinnode.cli import _bench_system
+from skinnode.cli._bench_output import JsonFile, PlotFile, Rounds, prepare, print_machine, write
 from skinnode.cli._help import App
 from skinnode.errors import ConfigError
 
 app = App(help="Measure the performance of solver, node and host on this machine.", no_args_is_help=True)
-
-JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Also write the results to FILE.")
-]
-PlotFile = Annotated[
-    Path | None, typer.Option("--plot", metavar="FILE", help="Plot the results to FILE (needs matplotlib).")
-]
-Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per implementation.")]
 
 
 @app.command()
@@ -32,9 +26,9 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
     """
     from skinnode.bench import kernel as bench
 
-    _prepare(json, plot)
+    prepare(json, plot)
     figures = bench.run(rounds)
-    _print_machine(figures)
+    print_machine(figures)
     typer.echo(f"{'':28}{'':22}{'µs':>10}{'ratio':>8}")
     for row in figures["rows"]:
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
@@ -43,7 +37,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
         "trust radius is so small that every operator must shorten its step. skinnode, LAPACK and BLAS use\n"
         "one thread."
     )
-    _write(json, figures)
+    write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.ratios import draw_kernel
 
@@ -58,9 +52,9 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
     """
     from skinnode.bench import solve as bench
 
-    _prepare(json, plot)
+    prepare(json, plot)
     figures = bench.run(rounds)
-    _print_machine(figures)
+    print_machine(figures)
     typer.echo(f"{'':42}{'µs per wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
     for row in figures["rows"]:
         spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
@@ -70,7 +64,7 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
     )
     if not any("pyceres" in row["who"] for row in figures["rows"]):
         typer.echo("Ceres is not installed; to measure it too, run sh install.sh bench.")
-    _write(json, figures)
+    write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.ratios import draw_solve
 
@@ -91,12 +85,12 @@ def stability(
     from skinnode.bench import stability as bench
     from skinnode.bench.verdict import named
 
-    _prepare(json, plot)
+    prepare(json, plot)
     typer.echo(bench.HEAD)
     figures = bench.run(seeds, jobs=jobs, report=lambda row: typer.echo(bench.line(row)))
     off = [row for row in figures["rows"] if row["wrong"]]
     wrong = [row for row in off if not row["known_limit"]]
-    _print_machine(figures)
+    print_machine(figures)
     typer.echo(bench.LEGEND)
     each = "one seed" if seeds == 1 else f"{seeds} seeds each"
     typer.echo(f"\n{len(figures['rows'])} rows, {each}: {len(wrong)} converged and wrong")
@@ -105,7 +99,7 @@ def stability(
     for row in off:
         if row["known_limit"]:
             typer.echo(f"  known limit: {named(row)}")
-    _write(json, figures)
+    write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.stability import draw
 
@@ -151,7 +145,7 @@ def trust(
     from skinnode.bench import trust as bench
     from skinnode.bench.trust_report import lines
 
-    _prepare(json)
+    prepare(json)
 
     def progress(line: str) -> None:
         typer.echo(line, err=True)
@@ -168,8 +162,8 @@ def trust(
         raise ConfigError("--only", ", ".join(wanted), "part of a section and row, such as single: crossing")
     for line in lines(figures):
         typer.echo(line)
-    _print_machine(figures)
-    _write(json, figures)
+    print_machine(figures)
+    write(json, figures)
     if kept is not None:
         kept.unlink(missing_ok=True)  # this file is needed only to continue an interrupted run
     if not all(row["reached"] for row in figures["must"]):
@@ -219,7 +213,7 @@ def accuracy(
         return
     from skinnode.bench import accuracy as bench
 
-    _prepare(json, plot)
+    prepare(json, plot)
     if only is not None:
         if plot is not None and only != "pareto":
             raise typer.BadParameter(f"got --plot, but --only {only} has no plot", param_hint="--plot")
@@ -237,9 +231,9 @@ def accuracy(
             figures = bench.run_pareto(scenes, progress)
     else:
         figures = bench.run(scenes, rounds)
-    _print_machine(figures)
+    print_machine(figures)
     bench.print_all(figures, typer.echo)
-    _write(json, figures)
+    write(json, figures)
     if plot is not None:
         from skinnode.bench.plots import accuracy as whole
         from skinnode.bench.plots import pareto
@@ -253,11 +247,11 @@ def _detection(json: Path | None, plot: Path | None, seed: int, presses: int, ho
     from skinnode.bench import accuracy_detection as bench
     from skinnode.bench.accuracy_detection_report import print_all
 
-    _prepare(json, plot)
+    prepare(json, plot)
     figures = bench.run(seed, presses, hours)
-    _print_machine(figures)
+    print_machine(figures)
     print_all(figures, typer.echo)
-    _write(json, figures)
+    write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.detection import draw
 
@@ -278,329 +272,16 @@ def path(
     from skinnode.bench import path as bench
     from skinnode.text.json_values import plain
 
-    _prepare(json, plot)
+    prepare(json, plot)
     figures = bench.run(experiments)
-    _print_machine(figures)
+    print_machine(figures)
     bench.print_all(figures, typer.echo)
-    _write(json, plain(figures))
+    write(json, plain(figures))
     if plot is not None:
         from skinnode.bench.plots.path import draw
 
         draw(plot, figures)
 
 
-@app.command()
-def scale(
-    json: JsonFile = None,
-    plot: PlotFile = None,
-    patches: Annotated[
-        list[int] | None,
-        typer.Option(min=1, max=1000, help="Number of patches; one patch is touched. Can be repeated."),
-    ] = None,
-    scans: Annotated[
-        int,
-        typer.Option(min=1, max=10_000, help="Number of scans per measurement; fewer for large hands."),
-    ] = 20,
-    real_time: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=3600.0,
-            help="Duration of each measurement in real time on udp_multicast, in s; 0 skips them.",
-            metavar="S",
-        ),
-    ] = 10.0,
-) -> None:
-    """Measure how the CPU time and memory of the simulator and the host grow with skin area and touched area.
-
-    Hands run in virtual time, except for the measurements on udp_multicast. By default, the largest hand has
-    1,000 patches, and the benchmark takes several minutes.
-    """
-    from skinnode.bench import real_time as multicast
-    from skinnode.bench import scale as bench
-
-    _prepare(json, plot)
-    measured = multicast.run(real_time) if real_time else {}
-    if measured:
-        _print_real_time(measured)
-    figures = bench.run(patches or bench.PATCHES, scans) | {"real_time": measured}
-    _print_machine(figures)
-    typer.echo("CPU time per patch and scan, ms")
-    typer.echo(
-        f"{'patches':>8}{'touched':>9}{'chunks':>9}{'nodes':>8}{'bus':>8}{'host':>8}"
-        f"{'virtual/real time':>19}{'MB':>7}"
-    )
-    for row in figures["area"] + figures["contact"] + figures["changed"]:
-        times = "".join(f"{row[key]:8.2f}" for key in ("nodes_ms", "bus_ms", "host_ms"))
-        chunks = "changed" if row["changed_only"] else "all"
-        typer.echo(
-            f"{row['patches']:8}{row['touched']:9}{chunks:>9}{times}"
-            f"{row['faster']:19.2f}{row['memory_mb']:7.0f}"
-        )
-    reading = figures["physics"]
-    share = 100 * reading["untouched_us"] / reading["touched_us"]
-    typer.echo(
-        f"time to simulate the skin for one scan: touched {reading['touched_us']:.0f} µs, "
-        f"untouched {reading['untouched_us']:.1f} µs ({share:.1f} %); "
-        f"noise of the converter {reading['converter_us']:.1f} µs"
-    )
-    _write(json, figures)
-    if plot is not None:
-        from skinnode.bench.plots.scale import draw
-
-        draw(plot, figures)
-
-
-def _print_real_time(figures: dict[str, Any]) -> None:
-    """Print the real-time measurements of the simulator."""
-    for row in figures["rows"]:
-        scans = row["scans"] + row["skipped"]
-        typer.echo(
-            f"simulator in real time on udp_multicast, hop_limit {row['hop_limit']}: "
-            f"{row['patches']} patches, {row['touched']} touched, {row['frames_per_s']:.0f} frames/s: "
-            f"{row['simulator']:.2f} of a core, {row['skipped']} of {scans} scans skipped; "
-            f"host {row['host']:.2f} of a core, {row['fields']} fields; machine load {row['load']:.1f}"
-        )
-    times = figures["frame_us"]
-    typer.echo(
-        f"time to send a frame and to receive it at both endpoints: {times['python_can']:.1f} µs with "
-        f"python-can, {times['port']:.1f} µs with CanPort"
-    )
-
-
-@app.command()
-def node(
-    json: JsonFile = None,
-    seconds: Annotated[
-        float, typer.Option(min=0.2, max=3600.0, help="Duration of each measurement on the bus, in s.")
-    ] = 10.0,
-    rounds: Rounds = 31,
-    interface: Annotated[
-        str, typer.Option(help="python-can interface; virtual is a bus within the process.")
-    ] = "virtual",
-    channel: Annotated[
-        str | None, typer.Option(help="Channel of the interface; default: an unused name.")
-    ] = None,
-) -> None:
-    """Measure the timing accuracy and the CPU cost of a node.
-
-    The benchmark covers the pacing of chunks, the time from SYNC to the first chunk, the heartbeat on a full
-    bus, and the time in µs to handle each kind of frame.
-    """
-    from skinnode.bench import node as bench
-
-    _prepare(json)
-    figures = bench.run(seconds, rounds, interface, channel)
-    _print_machine(figures)
-    typer.echo(f"{'ms':30}{'p50':>8}{'p99':>8}{'max':>8}{'limit':>8}{'n':>8}{'frames/s received':>19}")
-    for row in figures["rows"]:
-        late_ms = [row[key] for key in ("p50_ms", "p99_ms", "max_ms")]
-        spread = "".join("       -" if value is None else f"{value:8.3f}" for value in late_ms)
-        typer.echo(f"{row['what']:30}{spread}{row['goal_ms']:8.1f}{row['n']:8}{row['load_hz']:19.0f}")
-    typer.echo(f"\n{'handled by the node':30}{'µs':>8}")
-    for row in figures["handling"]:
-        typer.echo(f"{row['what']:30}{row['us']:8.1f}")
-    typer.echo(
-        "\nExact pacing is for a board. Thrifty pacing is for many nodes on one machine; it sends bursts of\n"
-        "frames at the same mean rate. Other processes on this machine affect the measured times."
-    )
-    _write(json, figures)
-
-
-@app.command()
-def pipeline(
-    json: JsonFile = None,
-    plot: PlotFile = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Duration of each measurement, in s.")] = 10.0,
-    short: Annotated[bool, typer.Option("--short", help="Run only rows that have a requirement.")] = False,
-    interface: Annotated[
-        str, typer.Option(help="udp, or socketcan for the single bus given by --channel.")
-    ] = "udp",
-    channel: Annotated[str, typer.Option(help="Channel for socketcan.")] = "vcan0",
-    all_cores: Annotated[
-        bool, typer.Option("--all-cores", help="Allow the host and the load generator to use all cores.")
-    ] = False,
-) -> None:
-    """Run a host with sixteen patches on four fully loaded buses; measure losses, latency and CPU load.
-
-    The exit status is 1 if a frame was lost or the frame counts do not add up. The measured times do not
-    affect the exit status.
-    """
-    from skinnode.bench import pipeline as bench
-
-    if interface not in ("udp", "socketcan"):
-        raise ConfigError("--interface", interface, "udp or socketcan")
-    _prepare(json, plot)
-    typer.echo(bench.HEAD)
-    figures = bench.run(
-        seconds,
-        short=short,
-        interface=interface,
-        channel=channel,
-        all_cores=all_cores,
-        report=lambda row: typer.echo(bench.line(row)),
-    )
-    typer.echo(bench.LEGEND)
-    _print_machine(figures)
-    _print_must(figures["must"])
-    _write(json, figures)
-    if plot is not None:
-        from skinnode.bench.plots.pipeline import draw
-
-        draw(plot, figures)
-    lost = not all(row["reached"] for row in figures["must"] if not row["time"])
-    if lost or any(row["discrepancies"] for row in figures["rows"]):
-        raise typer.Exit(1)
-
-
-@app.command()
-def recording(
-    json: JsonFile = None,
-    buses: Annotated[int, typer.Option(min=1, max=8, help="Number of full buses, four patches each.")] = 4,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of each recording in minutes.")] = 1.0,
-    block: Annotated[
-        float, typer.Option(min=1, help="Duration of the simulated traffic, in s; the traffic is repeated.")
-    ] = 5.0,
-) -> None:
-    """Write recordings of fully loaded buses; measure their size, cost of writing and MCAP seek time."""
-    from skinnode.bench import recording as bench
-    from skinnode.messages.typestore import require_mcap
-
-    require_mcap("skinnode bench recording")
-    _prepare(json)
-    typer.echo(
-        f"{'format':18}{'GB/hour':>9}{'µs per frame':>14}{'µs per field':>14}"
-        f"{'ms per flush':>14}{'of a core':>11}"
-    )
-
-    def report(row: dict[str, Any]) -> None:
-        field_us = "-" if row["field_us"] is None else f"{row['field_us']:.0f}"
-        typer.echo(
-            f"{row['format']:18}{row['gb_per_hour']:9.2f}{row['frame_us']:14.1f}{field_us:>14}"
-            f"{row['flush_ms']:14.2f}{row['core']:10.1%}"
-        )
-
-    figures = bench.run(buses, minutes, block, report)
-    rates, seek = figures["rates"], figures["seek"]
-    typer.echo(
-        f"{rates['frames_hz']:.0f} frames/s, {rates['fields_hz']:.0f} fields/s, "
-        f"{rates['minutes']:.1f} minutes\n"
-        f"MCAP with fields: opened in {seek['open_s']:.2f} s, seek {seek['seek_ms']:.0f} ms "
-        f"(median of {bench.SEEKS}, at most {seek['seek_max_ms']:.0f} ms), {seek['chunks']} chunks"
-    )
-    _print_machine(figures)
-    _write(json, figures)
-
-
-@app.command()
-def remote(
-    json: JsonFile = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Duration, in s.")] = 60.0,
-    publish_only: Annotated[
-        bool, typer.Option("--publish-only", help="Measure the host without a second process or pings.")
-    ] = False,
-) -> None:
-    """Run a host with sixteen patches and a program in a second process; measure losses and latency.
-
-    At the same time, two more processes exchange field-sized pings over Zenoh. The exit status is 1 if a
-    field was lost. The measured times do not affect the exit status.
-    """
-    from skinnode.bench import remote as bench
-    from skinnode.remote.session import require_zenoh
-
-    require_zenoh("skinnode bench remote")
-    _prepare(json)
-    figures = bench.run(seconds, publish_only=publish_only, report=lambda row: None)
-    typer.echo(bench.line(figures["total"]))
-    _print_machine(figures)
-    _print_must(figures["must"])
-    _write(json, figures)
-    if not all(row["reached"] for row in figures["must"] if not row["time"]):
-        raise typer.Exit(1)
-
-
-@app.command()
-def soak(
-    json: JsonFile = None,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak test in minutes.")] = 10.0,
-    seed: Annotated[
-        int, typer.Option(help="Seed for the faults; the same seed reproduces the same rounds.")
-    ] = 1,
-    own_cache: Annotated[
-        bool, typer.Option(hidden=True, help="Run in this process, with the existing kernel cache.")
-    ] = False,
-) -> None:
-    """Run a simulated hand under random faults for minutes or hours.
-
-    CAN frames of every kind are dropped, other processes occupy the processors, and the kernel cache is
-    damaged at the start. The host must keep running, every patch must recover, all frame counts must add up,
-    and memory use and the numbers of threads and file descriptors must not grow. The exit status is 1 if any
-    of these requirements is not met.
-    """
-    from skinnode.bench import soak as bench
-
-    if not own_cache:
-        _prepare(json)
-        raise typer.Exit(_soak_on_damaged_cache(json, minutes, seed))
-    figures = bench.run(minutes, seed, typer.echo)
-    for line in bench.summary_lines(figures):
-        typer.echo(line)
-    _print_must(figures["must"])
-    _write(json, figures)
-    if missed := [row["what"] for row in figures["must"] if not row["reached"]]:
-        typer.echo(f"The soak failed: {'; '.join(missed)}.")
-        raise typer.Exit(1)
-
-
-def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
-    """Run the soak test in a child process with a damaged kernel cache; return the child's exit status."""
-    import subprocess
-    import sys
-    import tempfile
-
-    from skinnode.bench import soak_cache as cache
-
-    with tempfile.TemporaryDirectory(prefix="skinnode-soak-") as folder:
-        cache.fill(Path(folder))
-        typer.echo("The soak test starts with a damaged copy of the kernel cache:")
-        for line in cache.damage(Path(folder), seed):
-            typer.echo(f"  {line}")
-        command = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "bench", "soak"]
-        command += ["--minutes", str(minutes), "--seed", str(seed), "--own-cache"]
-        command += [] if json is None else ["--json", str(json)]
-        sys.stdout.flush()
-        return subprocess.run(command, env=cache.environment(Path(folder)), check=False).returncode
-
-
-def _print_must(must: list[dict[str, Any]]) -> None:
-    for row in must:
-        got = "-" if row["got"] is None else f"{row['got']:.2f}".removesuffix(".00")
-        verdict = "met" if row["reached"] else "NOT MET"
-        typer.echo(f"{row['what']:69}{got:>9}  limit {row['asked']:g}: {verdict}")
-
-
-def _prepare(json: Path | None, plot: Path | None = None) -> None:
-    """Check that the output files can be written, and report whether the kernels must be compiled first."""
-    from skinnode.compiled.jit import is_cold
-    from skinnode.files.output_file import require_writable
-    from skinnode.files.plot_file import require_matplotlib
-
-    if json is not None:
-        require_writable("--json", json)
-    if plot is not None:
-        require_matplotlib(plot)
-        require_writable("--plot", plot)
-
-    if is_cold():
-        typer.echo("Compiling the kernels; later starts use the compiled code.", err=True)
-
-
-def _print_machine(figures: dict[str, Any]) -> None:
-    typer.echo(", ".join(f"{key} {value}" for key, value in figures["machine"].items()))
-
-
-def _write(path: Path | None, figures: dict[str, Any]) -> None:
-    if path is not None:
-        from skinnode.bench.timing import write_json
-
-        write_json(path, figures)
+for command in _bench_system.COMMANDS:
+    app.command()(command)

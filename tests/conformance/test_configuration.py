@@ -45,17 +45,13 @@ def configure(dut: Dut) -> None:
 
 def test_a_stored_configuration_is_found_again(dut: Dut) -> None:
     configure(dut)
-    try:
-        before = {key: dut.sdo.read(*key) for key in FOUND}
-        assert before == FOUND
-        report = run_cases(dut, select(("OTHER-02", "OTHER-04", "OTHER-08", "SYNC-10")))
-        assert [result.verdict for result in report.results] == [Verdict.PASSED] * 4
-        assert report.problems == ()
-        dut.prepare()
-        assert {key: dut.sdo.read(*key) for key in FOUND} == FOUND
-    finally:
-        dut.sdo.write(0x1011, 1, b"load")
-        dut.prepare()
+    before = {key: dut.sdo.read(*key) for key in FOUND}
+    assert before == FOUND
+    report = run_cases(dut, select(("OTHER-02", "OTHER-04", "OTHER-08", "SYNC-10")))
+    assert [result.verdict for result in report.results] == [Verdict.PASSED] * 4
+    assert report.problems == ()
+    dut.prepare()
+    assert {key: dut.sdo.read(*key) for key in FOUND} == FOUND
 
 
 def test_an_interrupted_run_resets_the_node(dut: Dut) -> None:
@@ -80,33 +76,25 @@ def test_a_restoration_that_is_interrupted_is_done_again(dut: Dut, monkeypatch: 
         write(index, subindex, data)
 
     monkeypatch.setattr(dut.sdo, "write", write_until_interrupted)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run_cases(dut, [Case("OD-00", "restores the defaults", "none", lambda dut: dut.to_defaults())])
-        dut.prepare()
-        assert {key: dut.sdo.read(*key) for key in FOUND} == FOUND
-    finally:
-        dut.sdo.write(0x1011, 1, b"load")
-        dut.prepare()
+    with pytest.raises(KeyboardInterrupt):
+        run_cases(dut, [Case("OD-00", "restores the defaults", "none", lambda dut: dut.to_defaults())])
+    dut.prepare()
+    assert {key: dut.sdo.read(*key) for key in FOUND} == FOUND
 
 
 def test_a_pdo_without_a_can_id_is_not_enabled(dut: Dut) -> None:
     """With the CAN-ID 0, it would be an NMT command to other nodes."""
-    try:
-        for parameter in (0x1800, 0x1801):
-            dut.sdo.write(parameter, 1, struct.pack("<I", 1 << 31))
-        dut.sdo.write(0x1010, 1, b"save")
-        results = run_cases(dut, select(("PDO-06", "SYNC-03"))).results
-        assert [result.verdict for result in results] == [Verdict.NOT_APPLICABLE] * 2
-        assert "TPDO1 has no CAN-ID" in results[0].why
-        written = [
-            int.from_bytes(line.data[4:], "little")
-            for result in results
-            for line in result.trace
-            if line.sent and line.data[:4] in (b"\x23\x00\x18\x01", b"\x23\x01\x18\x01")
-        ]
-        assert written
-        assert all(cob_id >> 31 for cob_id in written)
-    finally:
-        dut.sdo.write(0x1011, 1, b"load")
-        dut.prepare()
+    for parameter in (0x1800, 0x1801):
+        dut.sdo.write(parameter, 1, struct.pack("<I", 1 << 31))
+    dut.sdo.write(0x1010, 1, b"save")
+    results = run_cases(dut, select(("PDO-06", "SYNC-03"))).results
+    assert [result.verdict for result in results] == [Verdict.NOT_APPLICABLE] * 2
+    assert "TPDO1 has no CAN-ID" in results[0].why
+    written = [
+        int.from_bytes(line.data[4:], "little")
+        for result in results
+        for line in result.trace
+        if line.sent and line.data[:4] in (b"\x23\x00\x18\x01", b"\x23\x01\x18\x01")
+    ]
+    assert written
+    assert all(cob_id >> 31 for cob_id in written)

@@ -22,7 +22,7 @@ from skinnode.host.sync import Ticks
 from skinnode.host.workers import Inline, Job, OnError, Workers
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
-from skinnode.model.layout import PatchLayout
+from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
 from skinnode.process import clock
 from skinnode.protocol.assembler import ScanAssembler
@@ -76,12 +76,25 @@ def ticks() -> Ticks:
     return Ticks(240)
 
 
+def stream_of(
+    workers: Workers | Inline,
+    publisher: Publisher,
+    ticks: Ticks,
+    solver: Any,
+    defects: Defects | None = None,
+    **options: Any,
+) -> PatchStream:
+    output = StreamOutput(workers, publisher, defects)
+    assembler = ScanAssembler(PROFILE, counter_overflow=240)
+    stream = PatchStream("thumb", assembler, output, StreamOptions(ticks.find, **options))
+    stream.resume(solver, 0, anew=True)
+    return stream
+
+
 @pytest.fixture
 def stream(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[PatchStream]:
-    assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(2, "solve") as workers:
-        stream = PatchStream("thumb", assembler, StreamOutput(workers, publisher), StreamOptions(ticks.find))
-        stream.resume(stub, 0, anew=True)
+        stream = stream_of(workers, publisher, ticks, stub)
         yield stream
         stub.go.set()
         stream.close()
@@ -91,10 +104,10 @@ def all_accounted_for(stats: StreamStats) -> bool:
     return stats.offered == stats.solved + stats.skipped
 
 
-def feed(stream: PatchStream, counter: int, t_ns: int) -> None:
-    """A whole scan at rest."""
-    chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), counter, PROFILE)
-    for chunk in chunks:
+def feed(stream: PatchStream, counter: int, t_ns: int, ohm: Float = REST_OHM, without: int = -1) -> None:
+    """A scan at rest or with the resistances ``ohm``, whole or without one of its chunks."""
+    chunks = pack_scan(encode(ohm, REST_OHM, CodeScale()), counter, PROFILE)
+    for chunk in chunks[:without] + chunks[without + 1 :] if without >= 0 else chunks:
         stream.on_chunk(chunk, t_ns)
     stream.on_summary(pack_summary(counter, SummaryFlag(0), len(chunks), 1000 * counter), t_ns)
 
@@ -159,19 +172,9 @@ def test_scan_with_a_chunk_missing_is_withheld_by_policy(
 ) -> None:
     stub.go.set()
     fields = publisher.subscribe(10, 10.0, None)
-    assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(1, "solve") as workers:
-        stream = PatchStream(
-            "thumb",
-            assembler,
-            StreamOutput(workers, publisher),
-            StreamOptions(ticks.find, partial="withhold"),
-        )
-        stream.resume(stub, 0, anew=True)
-        chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
-        for chunk in chunks[1:]:
-            stream.on_chunk(chunk, 0)
-        stream.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
+        stream = stream_of(workers, publisher, ticks, stub, partial="withhold")
+        feed(stream, 1, 0, without=0)
         feed(stream, 2, 80 * MS)  # ends the torn one
         stream.poll(80 * MS)
         field = fields.get(10)
@@ -188,10 +191,7 @@ def test_scan_with_a_chunk_missing_goes_on_with_a_mask(
     stream: PatchStream, stub: Stub, publisher: Publisher
 ) -> None:
     stub.go.set()
-    chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
-    for chunk in chunks[:3] + chunks[4:]:
-        stream.on_chunk(chunk, 0)
-    stream.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
+    feed(stream, 1, 0, without=3)
     assert stream.stats().offered == 0
     stream.poll(100 * MS)
     assert eventually(lambda: stream.stats().solved == 1)
@@ -254,17 +254,6 @@ class Full(Inline):
         super().submit(job, on_error)
 
 
-def stream_of(
-    workers: Inline, publisher: Publisher, ticks: Ticks, solver: Any, defects: Defects | None = None
-) -> PatchStream:
-    assembler = ScanAssembler(PROFILE, counter_overflow=240)
-    stream = PatchStream(
-        "thumb", assembler, StreamOutput(workers, publisher, defects), StreamOptions(ticks.find)
-    )
-    stream.resume(solver, 0, anew=True)
-    return stream
-
-
 def test_a_scan_that_no_worker_takes_costs_itself(stub: Stub, publisher: Publisher, ticks: Ticks) -> None:
     workers, fields = Full(), publisher.subscribe(10, 10.0, None)
     stub.go.set()
@@ -313,18 +302,9 @@ def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
     solver = ScanSolver(facts, hand.solver, lambda: 7 * MS)
     pressed_m = LAYOUT.upper_m - [0.0, 0.0, 0.05e-3]
     pressed_ohm = resistance_ohm(LAYOUT, pressed_m)
-    stream = PatchStream(
-        "thumb",
-        ScanAssembler(PROFILE, counter_overflow=240),
-        StreamOutput(Inline(), publisher),
-        StreamOptions(ticks.find),
-    )
-    stream.resume(solver, 0, anew=True)
+    stream = stream_of(Inline(), publisher, ticks, solver)
     fields = publisher.subscribe(10, 10.0, None)
-    chunks = pack_scan(encode(pressed_ohm, REST_OHM, CodeScale()), 1, PROFILE)
-    for chunk in chunks:
-        stream.on_chunk(chunk, MS)
-    stream.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 1000), MS)
+    feed(stream, 1, MS, pressed_ohm)
     field = fields.get(0)
     assert field is not None
     assert (field.method, field.trusted, stream.stats().invalid_codes) == (method, True, 0)
@@ -341,26 +321,14 @@ def test_the_field_of_a_moving_skin_belongs_to_the_time_of_its_scan(
     hand, row_s, speed_m_s = make_hand(1, solver={"method": "exact"}), 5e-3, 1e-3
     patch = hand.patches[0].model_copy(update={"row_time_us": 1e6 * row_s})
     facts = NodeFacts(patch, LAYOUT, PROFILE, CodeScale(), REST_OHM, None, 0.25)
-    stream = PatchStream(
-        "thumb",
-        ScanAssembler(PROFILE, counter_overflow=240),
-        StreamOutput(Inline(), publisher),
-        StreamOptions(ticks.find),
-    )
-    stream.resume(ScanSolver(facts, hand.solver), 0, anew=True)
+    stream = stream_of(Inline(), publisher, ticks, ScanSolver(facts, hand.solver))
     fields = publisher.subscribe(10, 10.0, None)
     for number in (1, 2, 4):
         t_s = 0.08 * number
         sampled_s = t_s + row_s * np.arange(LAYOUT.shape[0])[:, None]
         upper_m = LAYOUT.upper_m.copy()
         upper_m[..., 2] -= speed_m_s * sampled_s
-        ohm = resistance_ohm(LAYOUT, upper_m)
-        chunks = pack_scan(encode(ohm, REST_OHM, CodeScale()), number, PROFILE)
-        for chunk in chunks:
-            stream.on_chunk(chunk, round(1e9 * t_s))
-        stream.on_summary(
-            pack_summary(number, SummaryFlag(0), len(chunks), 80_000 * number), round(1e9 * t_s)
-        )
+        feed(stream, number, round(1e9 * t_s), resistance_ohm(LAYOUT, upper_m))
         field = fields.get(0)
         assert field is not None
     assert field.trusted
@@ -376,22 +344,12 @@ def test_drift_while_sync_pauses_is_no_touch(
     ordinary = PatchConfig(name="thumb", node_id=5).tolerances  # a drift of 2 % contradicts exact ones
     patch = hand.patches[0].model_copy(update={"relative_noise": 1e-3, "tolerances": ordinary})
     facts = NodeFacts(patch, LAYOUT, PROFILE, CodeScale(), REST_OHM, None, 0.25)
-    stream = PatchStream(
-        "thumb",
-        ScanAssembler(PROFILE, counter_overflow=240),
-        StreamOutput(Inline(), publisher),
-        StreamOptions(ticks.find),
-    )
-    stream.resume(ScanSolver(facts, hand.solver), 0, anew=True)
+    stream = stream_of(Inline(), publisher, ticks, ScanSolver(facts, hand.solver))
     fields, touched = publisher.subscribe(10, 10.0, None), []
     for number in range(1, 61):
         paused = number > 30
         ohm = REST_OHM * (1.02 if paused else 1.0) * (1.0 + 1e-3 * rng.standard_normal(LAYOUT.shape))
-        t_ns = (number * 80 + paused * 8 * 3_600_000) * MS
-        chunks = pack_scan(encode(ohm, REST_OHM, CodeScale()), number, PROFILE)
-        for chunk in chunks:
-            stream.on_chunk(chunk, t_ns)
-        stream.on_summary(pack_summary(number, SummaryFlag(0), len(chunks), 1000), t_ns)
+        feed(stream, number, (number * 80 + paused * 8 * 3_600_000) * MS, ohm)
         field = fields.get(0)
         assert field is not None
         touched.append(field.touched)

@@ -40,20 +40,20 @@ def truth_m(depth: Depth, t_s: float) -> np.ndarray:
     return hertz_press(SMALL, depth(t_s), centre_m=(7.1e-3, 9.3e-3))
 
 
-def reading(depth: Depth, t_s: float, rng: np.random.Generator) -> np.ndarray:
+def reading(depth: Depth, t_s: float, rng: np.random.Generator, row_s: float = ROW_S) -> np.ndarray:
     """Resistances of a scan in which each upper wire is sampled at its own time, with noise."""
-    rows = [truth_m(depth, t_s + u * ROW_S)[u] for u in WIRES]
+    rows = [truth_m(depth, t_s + u * row_s)[u] for u in WIRES]
     return frame_ohm(SMALL, np.stack(rows)) * (1.0 + SIGMA * rng.standard_normal(SMALL.shape))
 
 
 def solved(
-    solver: sk.Tracker, depth: Depth, times_s: np.ndarray, *, stamped: bool = False
+    solver: sk.Tracker, depth: Depth, times_s: np.ndarray, *, stamped: bool = False, row_s: float = ROW_S
 ) -> list[FieldFrame]:
     rng, fields = np.random.default_rng(1), []
     for t_s in times_s:
         if stamped:
             solver.t_ns = round(t_s * SECOND_NS)
-        fields.append(solver.update(reading(depth, t_s, rng)))
+        fields.append(solver.update(reading(depth, t_s, rng, row_s)))
     return fields
 
 
@@ -131,16 +131,17 @@ def test_a_long_scan_period_is_no_gap():
     slow = 150.0  # scans every 3 s
     times = slow * PERIOD_S * np.arange(14)
     depth, row_s = (lambda t_s: pressing(t_s / slow)), slow * ROW_S
-    fields = []
-    for stamped in (True, False):
-        rng, solver = np.random.default_rng(1), tracker(row_time_s=row_s, scan_period_s=slow * PERIOD_S)
-        for t_s in times:
-            if stamped:
-                solver.t_ns = round(t_s * SECOND_NS)
-            rows = [truth_m(depth, t_s + u * row_s)[u] for u in WIRES]
-            ohm = frame_ohm(SMALL, np.stack(rows)) * (1.0 + SIGMA * rng.standard_normal(SMALL.shape))
-            fields.append(solver.update(ohm))
-    for with_times, without in zip(fields[:14], fields[14:], strict=True):
+    pairs = [
+        solved(
+            tracker(row_time_s=row_s, scan_period_s=slow * PERIOD_S),
+            depth,
+            times,
+            stamped=stamped,
+            row_s=row_s,
+        )
+        for stamped in (True, False)
+    ]
+    for with_times, without in zip(*pairs, strict=True):
         np.testing.assert_array_equal(with_times.displacement_m, without.displacement_m)
         np.testing.assert_array_equal(with_times.displacement_std_m, without.displacement_std_m)
 

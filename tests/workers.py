@@ -31,6 +31,9 @@ WORKERS = 7
 REAL_TIME = "real_time"
 """Marker and group of the tests that count frames in real time and would disturb each other."""
 
+DAEMONS = "daemons"
+"""Group of the tests whose daemons are forked from one process, which takes 1.6 s of CPU time to load."""
+
 PAGES = "pages"
 """Group of the pages of docs/: as long as all other real-time tests, but they mostly wait."""
 
@@ -57,9 +60,12 @@ def is_whole(config: pytest.Config) -> bool:
 def group_of(item: pytest.Item) -> str | None:
     """Return the group of a test; None if it has none.
 
-    Tests that share a fixture of their module are a group, as each worker would make that fixture again."""
+    Tests that share a fixture of their module are a group, as each worker would make that fixture again. So
+    are those that share the process from which daemons are forked."""
     if item.get_closest_marker(REAL_TIME):
         return PAGES if item.path.name == "test_blocks.py" else REAL_TIME
+    if "forks" in item.fixturenames:
+        return DAEMONS
     fixtures = item._fixtureinfo.name2fixturedefs.values()
     return item.path.stem if any(found[-1].scope == "module" for found in fixtures) else None
 

@@ -16,7 +16,8 @@ class SignalEvent(threading.Event):
     """Event that can be set in a signal handler.
 
     ``threading.Event`` cannot: if the signal interrupts ``wait`` while it holds the event's lock, ``set``
-    blocks forever. This class is based on ``SimpleQueue.put``, which is reentrant.
+    blocks forever. This class is based on ``SimpleQueue.put``, which is reentrant. In virtual time, ``wait``
+    takes virtual time.
     """
 
     def __init__(self) -> None:

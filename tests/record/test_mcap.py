@@ -434,15 +434,15 @@ def test_the_command_tells_how_many_fields_it_wrote(tmp_path: Path) -> None:
     file, path = tmp_path / "hand.toml", tmp_path / "runs"
     sizes = "upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4"
     file.write_text(
-        f'[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "{hand.buses[0].channel}"\n'
+        f'[[buses]]\nname = "can0"\ninterface = "timed"\nchannel = "{hand.buses[0].channel}"\n'
         f'[sync]\nperiod_ms = 50\n[[patches]]\nname = "p0"\nnode_id = 5\nlayout = {{ {sizes} }}\n'
     )
     from skinnode.config import load_hand
 
-    with Fleet(load_hand(file)):
+    with VirtualClock(), Fleet(load_hand(file)):
         options = ["record", str(file), "-o", str(path), "--format", "mcap", "--seconds", "1"]
         done = CliRunner().invoke(app, options)
-    assert done.exit_code in (0, 1), done.output  # 1: on a busy machine, a scan may be missed
+    assert done.exit_code == 0, done.output
     (recording,) = path.iterdir()
     assert recording.suffix == ".mcap"
     (line,) = [each for each in done.output.splitlines() if "fields_dropped 0" in each]

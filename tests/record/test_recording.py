@@ -26,6 +26,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.process import clock
 from skinnode.record import Recorder, replay
 from skinnode.transport import CanPort
+from tests.commands import virtual_time
 from tests.conftest import BETWEEN_PROCESSES, bus_on
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
@@ -269,6 +270,7 @@ def test_listening_writes_what_is_heard_and_sends_nothing(any_bus: BusConfig, tm
     assert "note: the recording contains no baselines, as after skinnode record --listen; " in replayed.stdout
 
 
+CHANNEL = "record"
 HAND = """
 [bring_up]
 missing = "wait"
@@ -276,13 +278,13 @@ missing = "wait"
 period_ms = 100
 [[buses]]
 name = "can0"
-interface = "virtual"
-channel = "record"
+interface = "timed"
+channel = "{}"
 [[patches]]
 name = "thumb"
 node_id = 5
 layout = {{ {} }}
-""".format(", ".join(f"{key} = {value}" for key, value in SMALL.items()))
+""".format(CHANNEL, ", ".join(f"{key} = {value}" for key, value in SMALL.items()))
 
 
 @pytest.mark.parametrize("options", [[], ["--listen"]])
@@ -293,7 +295,8 @@ def test_a_recording_that_cannot_begin_leaves_nothing_in_the_way(tmp_path: Path,
     done = CliRunner().invoke(app, [*asked, "--interface", "nosuch"])
     assert isinstance(done.exception, BusError)
     assert list(tmp_path.iterdir()) == [hand]
-    CliRunner().invoke(app, asked)
+    with virtual_time(CHANNEL):
+        CliRunner().invoke(app, asked)
     assert path.exists()
     assert path.with_suffix(".jsonl").exists()
 
@@ -301,7 +304,8 @@ def test_a_recording_that_cannot_begin_leaves_nothing_in_the_way(tmp_path: Path,
 def test_a_recording_that_no_node_answers_leaves_nothing_in_the_way(tmp_path: Path) -> None:
     hand = tmp_path / "hand.toml"
     hand.write_text(HAND.replace('"wait"', '"refuse"'))
-    done = CliRunner().invoke(app, ["record", str(hand), "-o", str(tmp_path / "run.log")])
+    with virtual_time(CHANNEL):
+        done = CliRunner().invoke(app, ["record", str(hand), "-o", str(tmp_path / "run.log")])
     assert "no response within" in str(done.exception)
     assert list(tmp_path.iterdir()) == [hand]
 
@@ -309,7 +313,8 @@ def test_a_recording_that_no_node_answers_leaves_nothing_in_the_way(tmp_path: Pa
 def test_a_recording_without_a_field_is_a_fault_and_stays(tmp_path: Path) -> None:
     hand, path = tmp_path / "hand.toml", tmp_path / "run.log"
     hand.write_text(HAND)
-    done = CliRunner().invoke(app, ["record", str(hand), "-o", str(path), "--seconds", "1"])
+    with virtual_time(CHANNEL):
+        done = CliRunner().invoke(app, ["record", str(hand), "-o", str(path), "--seconds", "1"])
     assert done.exit_code == 1
     assert done.stdout.splitlines()[-1] == "fault: thumb: never seen at the end"
     assert list(replay(path)) == []
@@ -318,7 +323,9 @@ def test_a_recording_without_a_field_is_a_fault_and_stays(tmp_path: Path) -> Non
 def test_a_folder_that_is_not_there_is_made(tmp_path: Path) -> None:
     hand, folder = tmp_path / "hand.toml", tmp_path / "runs" / "today"
     hand.write_text(HAND)
-    done = CliRunner().invoke(app, ["record", str(hand), "-o", str(folder), "--listen", "--seconds", "0.1"])
+    asked = ["record", str(hand), "-o", str(folder), "--listen", "--seconds", "0.1"]
+    with virtual_time(CHANNEL):
+        done = CliRunner().invoke(app, asked)
     assert done.exit_code == 0, done.output
     assert sorted(file.suffix for file in folder.iterdir()) == [".jsonl", ".log"]
 
@@ -383,10 +390,10 @@ def test_scans_that_were_skipped_are_noted_as_a_replay_counts_them(
     solve = ScanSolver.solve
 
     def slowly(self: ScanSolver, *arguments: Any) -> Any:
-        time.sleep(0.1)
+        clock.sleep(0.1)
         return solve(self, *arguments)
 
-    with Fleet(load_hand(hand)), monkeypatch.context() as patched:
+    with VirtualClock(), Fleet(load_hand(hand)), monkeypatch.context() as patched:
         patched.setattr(ScanSolver, "solve", slowly)
         done = CliRunner().invoke(app, ["record", str(hand), "-o", str(path), "--seconds", "2"])
     run = replay(path)

@@ -288,17 +288,17 @@ def test_contacts_and_forces_are_in_the_json_of_host_and_replay(tmp_path: Path) 
     file, path = tmp_path / "hand.toml", tmp_path / "run.log"
     sizes = ", ".join(f"{name} = {value}" for name, value in SMALL.items())
     file.write_text(
-        f'[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
+        f'[[buses]]\nname = "can0"\ninterface = "timed"\nchannel = "{uuid.uuid4().hex}"\n'
         '[sync]\nperiod_ms = 25\n[solver]\nmethod = "posterior"\n[simulation]\ncycle_s = 2.0\n'
         f'[[patches]]\nname = "p0"\nnode_id = 5\nlayout = {{ preset = "staggered", {sizes} }}\n'
         'tolerances = "exact"\n'
     )
     hand = load_hand(file)
     live: dict[int, FieldFrame] = {}
-    with Fleet(hand):
+    with VirtualClock(), Fleet(hand):
         with Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
-            fields, end_s = host.fields(capacity=1000), time.monotonic() + 2.0
-            while time.monotonic() < end_s:
+            fields, end_s = host.fields(capacity=1000), clock.monotonic() + 2.0
+            while clock.monotonic() < end_s:
                 field = fields.get(0.1)
                 if field is not None and field.stamp is not None:
                     live[field.stamp.scan] = field

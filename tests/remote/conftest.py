@@ -15,6 +15,7 @@ import pytest
 import zenoh
 
 from skinnode.remote.session import PORTS
+from tests.remote.forks import Forked, Forks
 from tests.remote.ports import free_ports
 
 PATIENCE_S = 60.0
@@ -22,17 +23,14 @@ PATIENCE_S = 60.0
 
 
 class Process:
-    """A program of this folder, which ends with its standard input."""
+    """A program of this folder, which ends with its standard input; ``begin`` starts it."""
 
-    def __init__(self, program: str, *arguments: str) -> None:
-        path = Path(__file__).with_name(program)
-        self._command = [sys.executable, "-W", "error", str(path), *arguments]
+    def __init__(self, begin: Callable[[], subprocess.Popen[str] | Forked]) -> None:
+        self._begin = begin
         self.start()
 
     def start(self) -> None:
-        self.process = subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        self.process = self._begin()
 
     def wait_until_up(self) -> Self:
         assert self.process.stdout is not None
@@ -78,23 +76,43 @@ def port() -> int:
 
 
 @pytest.fixture
-def run() -> Iterator[Callable[..., Process]]:
-    """Start a program; all that still run are killed at the end."""
-    running: list[Process] = []
-
-    def run_one(program: str, *arguments: str) -> Process:
-        running.append(Process(program, *arguments))
-        return running[-1]
-
-    yield run_one
-    for each in running:
+def running() -> Iterator[list[Process]]:
+    """Programs that are killed at the end, if they still run."""
+    processes: list[Process] = []
+    yield processes
+    for each in processes:
         each.kill()
 
 
 @pytest.fixture
-def start(port: int, run: Callable[..., Process]) -> Callable[..., Process]:
+def run(running: list[Process]) -> Callable[..., Process]:
+    """Start a program of this folder."""
+
+    def run_one(program: str, *arguments: str) -> Process:
+        command = [sys.executable, "-W", "error", str(Path(__file__).with_name(program)), *arguments]
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        running.append(Process(lambda: subprocess.Popen(command, text=True, **pipes)))
+        return running[-1]
+
+    return run_one
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """All daemons are forked from one process."""
+    with contextlib.closing(Forks()) as forks:
+        yield forks
+
+
+@pytest.fixture
+def start(port: int, running: list[Process], forks: Forks) -> Callable[..., Process]:
     """Start a daemon with a simulated hand; see ``daemon.py``."""
-    return lambda **options: run("daemon.py", json.dumps({"port": port, **options}))
+
+    def start_one(**options: Any) -> Process:
+        running.append(Process(lambda: forks.start(json.dumps({"port": port, **options}))))
+        return running[-1]
+
+    return start_one
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ file descriptors of standard input, output and error, and of a pipe for the proc
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -40,7 +41,10 @@ class Forked:
         self.returncode: int | None = None
 
     def _number(self) -> int:
-        return int.from_bytes(os.read(self._status, LENGTH), "little", signed=True)
+        data = os.read(self._status, LENGTH)
+        if len(data) < LENGTH:  # as process ID 0, it would mean all processes of the tests
+            raise RuntimeError("the process from which daemons are forked has ended")
+        return int.from_bytes(data, "little", signed=True)
 
     def wait(self, timeout: float | None = None) -> int:
         if self.returncode is None:
@@ -51,6 +55,8 @@ class Forked:
         return self.returncode
 
     def send_signal(self, number: int) -> None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(0.0)  # another process may have its ID if it has ended
         if self.returncode is None:
             os.kill(self.pid, number)
 

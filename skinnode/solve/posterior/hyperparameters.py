@@ -244,8 +244,7 @@ class Hyperparameters:
         top = float(np.abs(estimator.moved).max())
         power = float((observation.weight**2).sum())
         same_noise = REFIT_NOISE**2 <= power / self._fitted_power <= REFIT_NOISE**-2
-        moved = change >= REFIT * top + NOISY * float(estimator.core.max())
-        if same_noise and not (uniform or self._rough or moved):
+        if same_noise and not (uniform or self._rough or self._has_moved(change, top)):
             return False
         self._fitted[:], self._fitted_power = estimator.moved, power
         strongest = float(np.exp(2.0 * discs.discs[:, 3]).max()) if len(discs.discs) else 0.0
@@ -267,6 +266,11 @@ class Hyperparameters:
         if local:
             variance = np.minimum(self.loads.expected(self._least), self._most)
             wanted = self._bounded(float(variance.mean()))
+    def _has_moved(self, change: float, top: float) -> bool:
+        """Return whether the field has moved by more than the noise since the discs were fitted."""
+        least = REFIT * top
+        return change >= least and change >= least + NOISY * float(self._estimator.core.max())
+
             changed = refine and prior.localise(variance)
         else:
             wanted = self._bounded(self._estimator.evidence_scale(SCALE_WORTH, self._expected))

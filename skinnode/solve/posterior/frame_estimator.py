@@ -340,10 +340,11 @@ class FrameEstimator:
         touched = self._gate.touched(at_rest, observation.count, self._members)
         # if no wire seems touched, use all wires to be sure
         wanted = touched if self.options.hold and touched.size else self._wires
-        seen = readings.usable
+        seen, near = readings.usable, False  # near: a field of fewer wires has been found with discs
         for _ in range(LEFT_OUT + 3):
             members = wanted[observation.count[wanted] > 0]
-            if not self._converge(observation, members):
+            near = near and self._estimator.track(observation, members)
+            if not (near or self._converge(observation, members)):
                 lost = [u for u in members.tolist() if not self._converge(observation, np.array([u]))]
                 if not lost or len(lost) > min(LEFT_OUT, len(status) - 1):
                     return self._give_up(Status.MAX_STEPS)
@@ -356,8 +357,9 @@ class FrameEstimator:
             fit = self._estimator.fit(observation, self._estimator.moved)
             joining = self._joining(fit, observation, wanted)
             if joining.size:
-                wanted = np.union1d(wanted, joining)
+                wanted, near = np.union1d(wanted, joining), self._hyper.keep_discs()
                 continue
+            near = False
             if self._beyond_prior(observation, roots.BELIEVABLE):
                 return self._give_up(Status.INCONSISTENT)
             excess = self._gate.excess(fit, observation.count)

@@ -121,6 +121,12 @@ class Hyperparameters:
         if self.discs is not None:
             self.discs.reset()
 
+    def keep_discs(self) -> bool:
+        """Return whether discs are in use, to be fitted again in the next solve, which uses more wires."""
+        kept = self.discs is not None and len(self.discs.discs) > 0
+        self._rough = self._rough or kept
+        return kept
+
     def with_discs(self, std: Float, core: Float) -> tuple[Float, Float]:
         """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
 

@@ -72,6 +72,8 @@ class UniformPrior:
     response_t: Float
     """(3Q, U f) transposed response."""
     covariance: Float
+    normal: Float
+    """(U f, Q) columns of ``response`` that belong to normal loads."""
     """(U f, U f) matrix C, in pitch²."""
     root: Float
     """(U f, U f) array containing the Cholesky factor of C."""
@@ -93,7 +95,8 @@ def _uniform_prior(elastic: ElasticPrior, free_bytes: bytes) -> UniformPrior:
     root = covariance.copy()
     cholesky(root, len(root))
     response_t = np.ascontiguousarray(response.T)
-    return UniformPrior(response, response_t, covariance, root, _blur(elastic.shape))
+    normal = np.ascontiguousarray(response[:, 2::3])
+    return UniformPrior(response, response_t, normal, covariance, root, _blur(elastic.shape))
 
 
 class LoadPrior:
@@ -112,6 +115,8 @@ class LoadPrior:
         uniform: (U f, U f) matrix C for equal expected loads over the whole patch; read-only.
         response: (U f, 3Q) displacement per unit load, in pitches.
         doubt: Factor applied to the part of the variance that depends on the prior.
+        response_t: (3Q, U f) transposed response.
+        normal_response: (U f, Q) displacement per unit of normal load, in pitches.
         smooth_share: Value of ``doubt`` for the 95 % interval.
         version: Number of times C has been rebuilt.
     """
@@ -119,7 +124,7 @@ class LoadPrior:
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
         self._of_layout = UniformPrior.of(elastic, free)
         self.response, self.uniform = self._of_layout.response, self._of_layout.covariance
-        self.response_t = self._of_layout.response_t
+        self.response_t, self.normal_response = self._of_layout.response_t, self._of_layout.normal
         self.covariance, self._root = self.uniform, self._of_layout.root
         self.doubt, self.smooth_share = PRIOR_DOUBT, SMOOTH_SHARE
         self.scale2 = 1.0

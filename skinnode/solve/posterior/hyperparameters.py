@@ -256,15 +256,20 @@ class Hyperparameters:
         strongest = float(np.exp(2.0 * discs.discs[:, 3]).max()) if len(discs.discs) else 0.0
         untouched2 = max(UNTOUCHED * self._least, FAR_LOADS**2 * strongest)
         everywhere2 = prior.scale2 if uniform else self._expected
-        variance = discs.fit(observation, members, untouched2, everywhere2, spread=not uniform)
+        variance = discs.fit(observation, members, untouched2, everywhere2, everywhere=uniform or self._rough)
         self._rough = uniform
         if variance is None:
             self._rejected, self._may_retry = top * math.sqrt(power), False
             prior.spread(everywhere2)
             estimator.track(observation, members)
             return self._set_scale(local=True, refine=True)
-        prior.set_discs(np.minimum(variance, self._most), discs.layer, untouched2)
+        prior.set_discs(np.minimum(variance, self._most), discs.response_t, untouched2)
         return True
+
+    def _has_moved(self, change: float, top: float) -> bool:
+        """Return whether the field has moved by more than the noise since the discs were fitted."""
+        least = REFIT * top
+        return change >= least and change >= least + NOISY * float(self._estimator.core.max())
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
         """Estimate the scale and the load locations from the evidence; return whether the prior changed."""
@@ -272,11 +277,6 @@ class Hyperparameters:
         if local:
             variance = np.minimum(self.loads.expected(self._least), self._most)
             wanted = self._bounded(float(variance.mean()))
-    def _has_moved(self, change: float, top: float) -> bool:
-        """Return whether the field has moved by more than the noise since the discs were fitted."""
-        least = REFIT * top
-        return change >= least and change >= least + NOISY * float(self._estimator.core.max())
-
             changed = refine and prior.localise(variance)
         else:
             wanted = self._bounded(self._estimator.evidence_scale(SCALE_WORTH, self._expected))

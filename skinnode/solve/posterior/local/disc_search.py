@@ -41,8 +41,14 @@ AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 SHAPES: Final = ((kernels.RADIUS, kernels.LAYER), (0.6, 4.0))
 """Radius R in cells and layer share β at which the search for a new disc starts: a contact on a half-space,
 and one on a thin bonded layer, which moves the skin only near the body."""
-REACH: Final = 4.5
-"""Radius around the start of a search within which the effects of loads are computed, in cells."""
+REACH: Final = 1.7
+"""Distance beyond a disc's radius up to which the effects of loads are computed, in cells. It leaves room for
+a step in the position or in the radius."""
+EDGE: Final = 0.8
+"""Distance beyond a disc's radius at which the load variance is a tenth of that in the middle, in cells. If
+the effects of loads at a smaller distance are missing, they are computed, and the search continues."""
+EXTENSIONS: Final = 3
+"""Maximum number of times that a search continues with more cells."""
 MOST: Final = 4
 """Number of discs at which the search is abandoned. Loads that require this many discs are not local."""
 WIDE: Final = 3.0
@@ -69,6 +75,7 @@ class DiscPrior:
 
     Attributes:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
+        response_t: (4Q, U f) displacement per unit load: the four loads of each cell, in pitches.
         spread: (U f,) variance of the displacement due to the uncertainty of the discs, in pitch².
     """
 
@@ -90,14 +97,17 @@ class DiscPrior:
             axis=1
         )
         gap = np.linalg.norm(self._place[:, None] - self._place, axis=-1)
-        self._near = np.asarray(
-            1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0)))
-        )
+        near = 1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0)))
+        self._near = np.asarray(near)
         self._scratch = kernels.make_scratch(len(self._place))
-        self.layer = layer
+        loads = LOADS * len(self._place)
+        self._gram, self._rows_t = np.empty((loads, loads)), np.empty(loads * estimator.equations)
         own = self._prior.response.reshape(len(layer), -1, 3)
-        self._response = np.concatenate([own, layer[..., None]], axis=2).reshape(len(layer), -1)
-        self._response_t = np.ascontiguousarray(self._response.T)
+        response = np.concatenate([own, layer[..., None]], axis=2).reshape(len(layer), -1)
+        self.response_t = np.ascontiguousarray(response.T)
+        self._probes = np.concatenate(
+            [near[self._inside] @ self.response_t[2::LOADS], self.response_t[3::LOADS][self._inside]]
+        )  # responses to the loads that are matched to the data
         self.discs: Float = np.empty((0, PARAMETERS))
         self.spread = np.zeros(len(self._prior.response))
 
@@ -113,35 +123,38 @@ class DiscPrior:
         untouched2: float,
         uniform2: float,
         *,
-        spread: bool,
+        everywhere: bool,
     ) -> Float | None:
         """Fit the discs to a frame, and return the load variances (2, Q), in pitch².
 
-        The estimator's factors are overwritten.
+        The estimator's factors are overwritten. The first discs of a touch, which are fitted again, have no
+        :attr:`spread`.
 
         Args:
             observation: The frame.
             members: Wires whose equations are used.
             untouched2: s² of the loads on untouched skin, in pitch².
             uniform2: s² of equal loads over the whole patch, in pitch².
-            spread: Whether to compute :attr:`spread` as well.
+            everywhere: Whether the discs are new. In this case, another disc is tried wherever a load matches
+                the remaining data best. Otherwise, discs beyond the current ones are tried only if the match
+                exceeds :data:`NOTICED`.
 
         Returns:
             The variances; None if the loads are not local.
         """
-        estimator = self._estimator
+        estimator, first = self._estimator, not len(self.discs)
         estimator.linearise(observation, members)
-        least = estimator.factorise_uniform(observation, uniform2) if not len(self.discs) else -math.inf
+        least = estimator.factorise_uniform(observation, uniform2) if first else -math.inf
         own = estimator.factorise_uniform(observation, untouched2)
         data = estimator.whitened_data()
-        search = _Search(self, data)
+        search = _Search(self, data, everywhere=everywhere)
         discs = search.start(self.discs)
         rejected: tuple[Float, float] | None = None
         while True:
-            places = search.places_of_next(discs)
+            places, beyond = search.places_of_next(discs)
             if not len(places):
                 break
-            more, gain = search.with_disc_at(places, discs)
+            more, gain = search.with_disc_at(places, discs, beyond=beyond)
             excess = gain - PAYS - math.log(PARAMETERS * len(more))
             if not excess > 0.0:
                 rejected = more, excess
@@ -153,9 +166,9 @@ class DiscPrior:
             return None
         self.discs = discs
         self.spread[:] = 0.0
-        if spread:
+        if not first:
             search.measure_spread(discs)
-        if spread and rejected is not None:
+        if rejected is not None and not first:
             search.add_spread_of_rejected(discs, *rejected)
         variance = np.empty((2, len(self._place)))
         kernels.add_variance(discs, self._place, variance)
@@ -165,92 +178,154 @@ class DiscPrior:
 class _Search:
     """Search for the discs of one frame, using the estimator's current whitened data."""
 
-    def __init__(self, prior: DiscPrior, data: Float) -> None:
-        self._p, self._data = prior, data
+    def __init__(self, prior: DiscPrior, data: Float, *, everywhere: bool) -> None:
+        self._p, self._data, self._everywhere = prior, data, everywhere
         self._estimator = prior._estimator
-        self._cells: Index = np.arange(0)
-        self._rows = np.empty((len(data), 0))
-        self._effects = Effects(np.empty((0, 2)), np.empty((0, 0)), np.empty(0))
-        self._match = self._estimator.match(data, prior._response_t)
+        self._cells: Index = np.arange(0)  # cells whose effects have been computed
+        self._position = np.full(len(prior._place), -1)  # of each cell among these
+        self._rows_t = np.empty((0, len(data)))
+        self._effects = Effects(np.empty((0, 2)), prior._gram, np.empty(0), 0.0)
         self._unit = np.zeros(2)
         self.evidence = 0.0
 
     def start(self, discs: Float) -> Float:
         """Return the discs of the last frame, refitted to this frame."""
-        if not len(discs):
-            return discs
-        self._include(discs[:, :2])
-        return self._climb(discs, 0)
+        if len(discs):
+            discs = self._fitted(discs)
+            if not self._everywhere:
+                self._set_unit(discs[0, :2])
+        return discs
 
-    def places_of_next(self, discs: Float) -> Float:
-        """Return the cells (P, 2) where another disc may be needed; none if no disc is needed.
+    def places_of_next(self, discs: Float) -> tuple[Float, bool]:
+        """Return cells (P, 2) where another disc may be needed, and whether they are beyond the discs.
 
-        In one of these cells, a load on a half-space matches the remaining data best; in the other, a load on
-        a bonded layer does.
+        There are none if no disc is needed. In one of two cells, a load on a half-space matches the remaining
+        data best; in the other, a load on a bonded layer does. If no match is noticed, but the discs are from
+        an earlier field, the cells are inside the discs, whose loads may have become unequal.
         """
+        p = self._p
         if len(discs) == MOST:
-            return np.empty((0, 2))
-        left = self._match
+            return np.empty((0, 2)), False
+        left = self._data
         if len(discs):
             q = np.empty(self._effects.match.size)
-            kernels.mean_loads(discs, self._effects, self._p._scratch, q)
-            left = self._estimator.match(self._data - self._rows @ q, self._p._response_t)
-        matches = np.abs([self._p._near @ left[2::LOADS], left[3::LOADS]])
-        best = np.argmax(np.where(self._p._inside, matches, 0.0), axis=1)
+            kernels.mean_loads(discs, self._effects, p._scratch, q)
+            left = left - q @ self._rows_t
+        matches, places = np.abs(self._estimator.match(left, p._probes)).reshape(2, -1), p._place[p._inside]
+        best, beyond = np.argmax(matches, axis=1), True
         if len(discs):
             noticed = matches[[0, 1], best] ** 2 >= NOTICED * self._unit
+            beyond = self._everywhere or bool(noticed.any())
             best = best[noticed]
-        return np.asarray(self._p._place[np.unique(best)])
+        if not beyond:
+            square = ((places[:, None] - discs[:, :2]) ** 2).sum(axis=-1)
+            within = (square <= np.exp(2.0 * discs[:, 2])).any(axis=1)
+            best = np.argmax(np.where(within, matches, 0.0), axis=1)
+        return places[np.unique(best)], beyond
 
-    def with_disc_at(self, places: Float, discs: Float) -> tuple[Float, float]:
-        """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence."""
+    def with_disc_at(self, places: Float, discs: Float, *, beyond: bool) -> tuple[Float, float]:
+        """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence.
+
+        The other discs are changed only if the new disc pays. If ``places`` are not ``beyond`` the discs, no
+        further cells are used.
+        """
         p, before = self._p, self.evidence
-        self._include(places)
+        own = self._near(places, np.full(len(places), kernels.RADIUS + REACH), include=beyond)
         if not len(discs):
-            near = p._near[np.argmin(((p._place - places[0]) ** 2).sum(axis=1))][self._cells]
-            gram = self._effects.gram
-            self._unit[:] = near @ gram[2::LOADS, 2::LOADS] @ near, gram.diagonal()[3::LOADS].max()
+            self._set_unit(places[0])
+        effects = self._given(discs, own) if len(discs) else self._effects
         trials = [
-            np.vstack([discs, [*place, math.log(radius), p._amplitude + more, math.log(layer)]])
+            np.array([[*place, math.log(radius), p._amplitude + more, math.log(layer)]])
             for place in places
             for radius, layer in SHAPES
             for more in AMPLITUDES
         ]
-        first = max(trials, key=lambda trial: kernels.evidence(trial, self._effects, p._scratch))
-        found = self._climb(first, len(discs))
-        gain = self.evidence - before
-        if len(discs) and gain > PAYS + math.log(PARAMETERS * len(found)):
-            found = self._climb(found, 0)
+        first = max(trials, key=lambda trial: kernels.evidence(trial, effects, p._scratch))
+        if not len(discs):
+            found = self._fitted(first)
             gain = self.evidence - before
+        else:
+            more, gain = self._climb(first, effects)
+            found = np.vstack([discs, more])
+            if gain > PAYS + math.log(PARAMETERS * len(found)):
+                found = self._fitted(found)
+                gain = self.evidence - before
         if not gain > PAYS + math.log(PARAMETERS * len(found)):
             self.evidence = before
         return found, gain
 
-    def _climb(self, discs: Float, first: int) -> Float:
-        p, found = self._p, discs.copy()
-        self.evidence = kernels.climb(
-            found, first, self._effects, p._amplitude, p._bounds, found.copy(), p._scratch
-        )
-        return found
-
-    def _include(self, places: Float) -> None:
-        """Compute the effects of loads on the cells near ``places`` (P, 2)."""
+    def _set_unit(self, place: Float) -> None:
+        """Compute the noise variance of the matches of loads like those at ``place``."""
         p = self._p
-        gap = np.linalg.norm(p._place[:, None] - places, axis=-1).min(axis=1)
-        fresh = np.setdiff1d(np.flatnonzero(gap <= REACH), self._cells)
-        if not fresh.size:
-            return
+        near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._cells]
+        self._unit[0] = ((near @ self._rows_t[2::LOADS]) ** 2).sum()
+        self._unit[1] = (self._rows_t[3::LOADS] ** 2).sum(axis=1).max()
+
+    def _fitted(self, discs: Float) -> Float:
+        """Return the discs with the largest evidence near ``discs``."""
+        self._near(discs[:, :2], np.exp(discs[:, 2]) + REACH)
+        for _ in range(EXTENSIONS):
+            discs, self.evidence = self._climb(discs, self._effects)
+            known = self._cells.size
+            self._near(discs[:, :2], np.exp(discs[:, 2]) + EDGE)
+            if self._cells.size == known:
+                break
+        return discs
+
+    def _climb(self, discs: Float, effects: Effects) -> tuple[Float, float]:
+        p, found = self._p, discs.copy()
+        work = np.empty((5, *found.shape))
+        evidence = kernels.climb(found, effects, p._amplitude, p._bounds, work, p._scratch)
+        return found, evidence
+
+    def _near(self, places: Float, reach: Float, *, include: bool = True) -> Index:
+        """Return the positions of the cells within ``reach`` (P,) of ``places`` (P, 2).
+
+        If ``include`` is true, the effects of loads on these cells are computed unless they are known.
+        """
+        place, reach = self._p._place, np.minimum(reach, WIDE + REACH)
+        square = ((place[:, None] - places) ** 2).sum(axis=-1)
+        near = np.flatnonzero((square <= reach**2).any(axis=1))
+        fresh = near[self._position[near] < 0]
+        if fresh.size and include:
+            self._position[fresh] = self._cells.size + np.arange(fresh.size)
+            self._add(fresh)
+        positions = self._position[near]
+        return positions[positions >= 0]
+
+    def _add(self, fresh: Index) -> None:
+        """Compute the effects of loads on the cells ``fresh``."""
+        p, old, gram = self._p, len(self._rows_t), self._effects.gram
+        response = np.ascontiguousarray(p.response_t[_loads_of(fresh)].T)
+        rows = np.empty((len(self._data), response.shape[1]))
+        self._estimator.whiten(response, rows)
         self._cells = np.concatenate([self._cells, fresh])
-        columns = (LOADS * fresh[:, None] + np.arange(LOADS)).ravel()
-        rows = np.empty((len(self._data), columns.size))
-        self._estimator.whiten(np.ascontiguousarray(p._response[:, columns]), rows)
-        self._rows = np.hstack([self._rows, rows])
-        gram = np.empty((self._rows.shape[1], self._rows.shape[1]))
-        multiply(np.ascontiguousarray(self._rows.T), self._rows, gram)
-        every = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
-        self._effects = Effects(
-            np.ascontiguousarray(p._place[self._cells]), gram, np.ascontiguousarray(self._match[every])
-        )
+        size, m = old + response.shape[1], len(self._data)
+        self._rows_t = p._rows_t[: size * m].reshape(size, m)
+        self._rows_t[old:] = rows.T
+        strip = np.empty((size, response.shape[1]))
+        multiply(self._rows_t, rows, strip)
+        gram[:size, old:size] = strip
+        gram[old:size, :old] = strip[:old].T
+        match = np.concatenate([self._effects.match, self._data @ rows])
+        self._effects = Effects(p._place[self._cells], gram, match, 0.0)
+
+    def _given(self, discs: Float, own: Index) -> Effects:
+        """Return the effects of the cells at positions ``own`` on what ``discs`` leave of the data."""
+        p, effects, loads = self._p, self._effects, LOADS * own.size
+        cross, gram, explained = np.empty((effects.match.size, loads)), *np.empty((2, loads, loads))
+        match = np.empty(loads)
+        count = kernels.whiten_by_discs(discs, effects, own, p._scratch, cross, gram, match)
+        cross = cross[: max(count, 0)]
+        multiply(np.ascontiguousarray(cross.T), cross, explained)
+        gram -= explained
+        match -= p._scratch.vector[: len(cross)] @ cross
+        strongest = float(np.exp(2.0 * discs[:, 3]).max())
+        return Effects(effects.place[own], gram, match, strongest)
+
+    def _response_t(self) -> Float:
+        """Return the displacement (4n, U f) per unit load on the cells whose effects have been computed."""
+        return np.asarray(self._p.response_t[_loads_of(self._cells)])
 
     def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
         """Add the variance due to a rejected disc that may nevertheless exist."""
@@ -258,27 +333,33 @@ class _Search:
         own, other = np.empty((2, effects.match.size))
         kernels.mean_loads(discs, effects, p._scratch, own)
         kernels.mean_loads(more, effects, p._scratch, other)
-        columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
         chance = 1.0 / (1.0 + math.exp(-excess))
-        p.spread += chance * (1.0 - chance) * (p._response[:, columns] @ (other - own)) ** 2
+        p.spread += chance * (1.0 - chance) * ((other - own) @ self._response_t()) ** 2
 
     def measure_spread(self, discs: Float) -> None:
-        """Add the variance of the displacement due to the uncertainty of each disc parameter."""
+        """Add the variance of the displacement due to the uncertainty of each disc parameter.
+
+        The displacement is averaged over three values of the parameter, weighted by their evidence.
+        """
         p, effects = self._p, self._effects
-        own, other = np.empty((2, effects.match.size))
-        columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
-        response = p._response[:, columns]
-        best = kernels.mean_loads(discs, effects, p._scratch, own)
-        best += kernels.log_prior(discs, p._amplitude)
-        for d in range(len(discs)):
-            for parameter in range(PARAMETERS):
-                weights, shifts = [1.0], [np.zeros(len(response))]
-                for sign in (1.0, -1.0):
-                    trial = discs.copy()
-                    trial[d, parameter] += sign * STEPS[parameter]
-                    found = kernels.mean_loads(trial, effects, p._scratch, other)
-                    found += kernels.log_prior(trial, p._amplitude)
-                    weights.append(math.exp(min(found - best, 0.0)))
-                    shifts.append(response @ (other - own))
-                weight, shift = np.array(weights) / sum(weights), np.array(shifts)
-                p.spread += weight @ (shift - weight @ shift) ** 2
+        own, others = np.empty(effects.match.size), np.empty((2 * discs.size, effects.match.size))
+        best = kernels.mean_loads(discs, effects, p._scratch, own) + kernels.log_prior(discs, p._amplitude)
+        weight = np.ones((discs.size, 3))
+        for i in range(2 * discs.size):
+            trial = discs.copy()
+            trial.ravel()[i // 2] += (1.0, -1.0)[i % 2] * STEPS[i // 2 % PARAMETERS]
+            found = kernels.mean_loads(trial, effects, p._scratch, others[i])
+            found += kernels.log_prior(trial, p._amplitude)
+            weight[i // 2, 1 + i % 2] = math.exp(min(found - best, 0.0))
+        weight /= weight.sum(axis=1, keepdims=True)
+        shift = np.zeros((discs.size, 3, len(p.spread)))
+        moved = np.empty((len(others), len(p.spread)))
+        multiply(others - own, self._response_t(), moved)
+        shift[:, 1:] = moved.reshape(discs.size, 2, -1)
+        shift -= np.einsum("pi,piu->pu", weight, shift)[:, None]
+        p.spread += np.einsum("pi,piu->u", weight, shift**2)
+
+
+def _loads_of(cells: Index) -> Index:
+    """Return the indices of the loads of ``cells``."""
+    return np.asarray((LOADS * cells[:, None] + np.arange(LOADS)).ravel())

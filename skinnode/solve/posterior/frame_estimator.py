@@ -420,16 +420,29 @@ class FrameEstimator:
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
         """Anneal from rest, and keep the tracked or the annealed field, whichever is more likely.
 
-        This method is called after a large movement, because tracking can then end at a wrong maximum.
+        This method is called after a large movement, because tracking can then end at a wrong maximum. The
+        annealed field expects equal loads over the whole patch. With discs, it is therefore compared with the
+        maximum that the tracked field leads to under the same prior, and discarded unless it is clearly more
+        likely; the discs remain in use.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
         tracked = estimator.moved.copy(), estimator.g.copy()
-        self._hyper.spread_as_seen(observation, members)
+        discs = self._hyper.spread_as_seen(observation, members)
         annealed = estimator.anneal(observation, members)
-        self._annealed = annealed and (
-            estimator.objective(observation) <= estimator.objective(observation, *tracked)
-        )
+        least = estimator.objective(observation)
+        if annealed and discs is not None:
+            other = estimator.moved.copy(), estimator.g.copy()
+            estimator.moved[:], estimator.g[:] = tracked
+            near = estimator.track(observation, members)
+            if near and estimator.objective(observation) <= least + roots.LIKELIER:
+                estimator.moved[:], estimator.g[:] = tracked
+                self._hyper.return_to(discs)
+                return True
+            estimator.moved[:], estimator.g[:] = other
+            self._annealed = estimator.track(observation, members)
+            return self._annealed
+        self._annealed = annealed and least <= estimator.objective(observation, *tracked)
         if self._annealed:
             return True
         estimator.moved[:], estimator.g[:] = tracked

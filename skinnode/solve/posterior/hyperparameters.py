@@ -102,6 +102,7 @@ class Hyperparameters:
         self._fitted_power = math.inf  # sum of 1/noise² over the readings to which the discs were fitted
         self._rejected = math.inf  # largest displacement over noise when no discs were found
         self._may_retry = False  # whether this happened in an earlier frame
+        self._disc_loads = np.empty((2, 0)), 0.0  # load variances of the discs, and of untouched skin
         self._fixed, self._clearance = scale2, clearance
         self._estimate_noise = estimate_noise
         self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
@@ -168,11 +169,27 @@ class Hyperparameters:
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
-    def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads over the whole patch, at a scale estimated from the frame with the old prior."""
+    def spread_as_seen(self, observation: Observation, members: Index) -> Float | None:
+        """Expect equal loads over the whole patch, at a scale estimated from the frame with the old prior.
+
+        Returns:
+            The discs in use, for :meth:`return_to`; None if there are none.
+        """
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
+        discs = None if self.discs is None or not len(self.discs.discs) else self.discs.discs
         self._forget_discs()
         self._prior.spread(guess)
+        return discs
+
+    def return_to(self, discs: Float) -> None:
+        """Return to the prior before :meth:`spread_as_seen`.
+
+        The next fit starts at the strongest disc alone, so that others are used only if they still pay.
+        """
+        assert self.discs is not None
+        self.discs.discs = discs[[np.argmax(discs[:, 3])]]
+        self._set_discs()
+        self._rough = True
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
@@ -263,8 +280,14 @@ class Hyperparameters:
             prior.spread(everywhere2)
             estimator.track(observation, members)
             return self._set_scale(local=True, refine=True)
-        prior.set_discs(np.minimum(variance, self._most), discs.response_t, untouched2)
+        self._disc_loads = np.minimum(variance, self._most), untouched2
+        self._set_discs()
         return True
+
+    def _set_discs(self) -> None:
+        assert self.discs is not None
+        variance, untouched2 = self._disc_loads
+        self._prior.set_discs(variance, self.discs.response_t, untouched2)
 
     def _has_moved(self, change: float, top: float) -> bool:
         """Return whether the field has moved by more than the noise since the discs were fitted."""

@@ -274,7 +274,7 @@ class _Search:
 
     def _climb(self, discs: Float, effects: Effects) -> tuple[Float, float]:
         p, found = self._p, discs.copy()
-        work = np.empty((5, *found.shape))
+        work = np.empty((3, *found.shape))
         evidence = kernels.climb(found, effects, p._amplitude, p._bounds, work, p._scratch)
         return found, evidence
 

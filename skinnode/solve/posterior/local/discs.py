@@ -253,38 +253,24 @@ def whiten_by_discs(  # noqa: PLR0913 - a kernel: arrays by name
     return LOADS * count
 
 
-@njit_part
-def _predicted_gain(tried: Float, d: int, p: int, step: float) -> float:
-    """Return the gain that a parabola predicts for a step of parameter ``p`` of disc ``d``; inf if unknown.
-
-    The parabola passes through 0 and the gains ``tried`` in the two directions: 1 and 3 contain steps, 2 and
-    4 gains.
-    """
-    up, down = tried[1, d, p], tried[3, d, p]
-    if not up * down < 0.0:
-        return math.inf
-    part: float = tried[2, d, p] * (step - down) / up - tried[4, d, p] * (step - up) / down
-    return part * step / (up - down)
-
-
 @njit
 def climb(  # noqa: PLR0913, C901 - a kernel: arrays by name
     discs: Float, effects: Effects, amplitude: float, bounds: Float, work: Float, s: Scratch
 ) -> float:
     """Improve the discs (D, 5) in place by a coordinate search; return their evidence plus log prior.
 
-    After a sweep without an improvement, the parabolas through the values found predict the gains of smaller
-    steps. Steps whose predicted gain is less than half of :data:`WORTH` are not tried.
+    After a sweep without an improvement, smaller steps are tried only in the direction in which the gain of
+    the larger step was greater.
 
     Args:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
         effects: Effects of the loads on the data.
         amplitude: Expected ln a.
         bounds: (2, 5) minimum and maximum of each parameter.
-        work: (5, D, 5) work array.
+        work: (3, D, 5) work array.
         s: Work arrays.
     """
-    trial = work[0]
+    trial, gain = work[0], work[1:]
     for d in range(discs.shape[0]):
         for p in range(PARAMETERS):
             trial[d, p] = discs[d, p]
@@ -294,22 +280,19 @@ def climb(  # noqa: PLR0913, C901 - a kernel: arrays by name
         better = False
         for d in range(discs.shape[0]):
             for p in range(PARAMETERS):
-                taken = False
+                taken, one_way = False, still and not better
                 for sign in range(2):
-                    if sign == 1 and taken:
-                        break
-                    step = scale * STEPS[p] * (1.0 - 2.0 * sign)
-                    if still and not better and _predicted_gain(work, d, p, step) < 0.5 * WORTH:
+                    if taken or (one_way and gain[sign, d, p] < gain[1 - sign, d, p]):
                         continue
-                    work[1 + 2 * sign, d, p] = 0.0
+                    step = scale * STEPS[p] * (1.0 - 2.0 * sign)
+                    gain[sign, d, p] = -math.inf
                     for attempt in range(4):
                         trial[d, p] = _allowed(discs[d, p] + step, p, bounds)
                         if trial[d, p] == discs[d, p]:
                             break
                         found = evidence(trial, effects, s) + log_prior(trial, amplitude)
                         if attempt == 0:
-                            work[1 + 2 * sign, d, p] = trial[d, p] - discs[d, p]
-                            work[2 + 2 * sign, d, p] = found - best
+                            gain[sign, d, p] = found - best
                         if not found > best + WORTH:
                             trial[d, p] = discs[d, p]
                             break

@@ -408,7 +408,10 @@ class FrameEstimator:
         estimator.g[:] = self._trusted_g
         self._annealed = False
         hurry = self._seconds < math.inf  # annealing takes as long as several normal solves
-        if (self._known or hurry) and estimator.track(observation, members):
+        core = estimator.core.copy()
+        if (self._known or hurry) and estimator.track(
+            observation, members, lambda: self._hyper.is_outdated(core)
+        ):
             gone = float(np.abs(estimator.moved - self._compared).max())
             far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
             if not far or hurry or self._anneal_and_compare(observation, members):

@@ -100,6 +100,7 @@ class Hyperparameters:
         self._rough = False  # whether the discs were fitted only to a field estimated with the uniform prior
         self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
         self._fitted_power = math.inf  # sum of 1/noise² over the readings to which the discs were fitted
+        self._outdated = False  # whether the field has left the discs since it was last fitted
         self._rejected = math.inf  # largest displacement over noise when no discs were found
         self._may_retry = False  # whether this happened in an earlier frame
         self._disc_loads = np.empty((2, 0)), 0.0  # load variances of the discs, and of untouched skin
@@ -119,6 +120,7 @@ class Hyperparameters:
         self._forget_discs()
 
     def _forget_discs(self) -> None:
+        self._outdated = False
         if self.discs is not None:
             self.discs.reset()
 
@@ -127,6 +129,18 @@ class Hyperparameters:
         kept = self.discs is not None and len(self.discs.discs) > 0
         self._rough = self._rough or kept
         return kept
+
+    def is_outdated(self, core: Float) -> bool:
+        """Return whether the field has moved so far that :meth:`adapt` will fit the discs again.
+
+        Args:
+            core: (U, f) standard deviations of the last field for the 95 % interval, in pitches.
+        """
+        moved = self._estimator.moved
+        change, top = float(np.abs(moved - self._fitted).max()), float(np.abs(moved).max())
+        in_use = self.discs is not None and len(self.discs.discs) > 0
+        self._outdated = in_use and self._has_moved(change, top, core)
+        return self._outdated
 
     def with_discs(self, std: Float, core: Float) -> tuple[Float, Float]:
         """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
@@ -267,8 +281,10 @@ class Hyperparameters:
         top = float(np.abs(estimator.moved).max())
         power = float((observation.weight**2).sum())
         same_noise = REFIT_NOISE**2 <= power / self._fitted_power <= REFIT_NOISE**-2
-        if same_noise and not (uniform or self._rough or self._has_moved(change, top)):
+        known = uniform or self._rough or self._outdated
+        if same_noise and not (known or self._has_moved(change, top, estimator.core)):
             return False
+        self._outdated = False
         self._fitted[:], self._fitted_power = estimator.moved, power
         strongest = float(np.exp(2.0 * discs.discs[:, 3]).max()) if len(discs.discs) else 0.0
         untouched2 = max(UNTOUCHED * self._least, FAR_LOADS**2 * strongest)
@@ -289,10 +305,9 @@ class Hyperparameters:
         variance, untouched2 = self._disc_loads
         self._prior.set_discs(variance, self.discs.response_t, untouched2)
 
-    def _has_moved(self, change: float, top: float) -> bool:
+    def _has_moved(self, change: float, top: float, core: Float) -> bool:
         """Return whether the field has moved by more than the noise since the discs were fitted."""
-        least = REFIT * top
-        return change >= least and change >= least + NOISY * float(self._estimator.core.max())
+        return change >= REFIT * top and change >= REFIT * top + NOISY * float(core.max())
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
         """Estimate the scale and the load locations from the evidence; return whether the prior changed."""

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -183,8 +184,16 @@ class MapEstimator:
 
     # -- solving ---------------------------------------------------------------------------------------
 
-    def track(self, observation: Observation, members: Index) -> bool:
+    def track(
+        self, observation: Observation, members: Index, is_near_enough: Callable[[], bool] = lambda: False
+    ) -> bool:
         """Solve from the current displacement, using the equations of the wires ``members`` (P,).
+
+        Args:
+            observation: The frame.
+            members: Wires whose equations are used.
+            is_near_enough: Function that returns whether a Gauss-Newton step suffices, because the prior will
+                change. In this case, there are no standard deviations.
 
         Returns:
             True if the solve converged; False if it found no maximum nearby.
@@ -198,6 +207,9 @@ class MapEstimator:
             if not size <= self._reach:
                 return False
             self._shorten(observation, *before)
+            if is_near_enough():
+                self.forget_factors()
+                return True
             self._measure(observation)
             if self._settle(observation):
                 return True

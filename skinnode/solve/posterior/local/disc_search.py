@@ -49,6 +49,8 @@ EDGE: Final = 0.8
 the effects of loads at a smaller distance are missing, they are computed, and the search continues."""
 EXTENSIONS: Final = 3
 """Maximum number of times that a search continues with more cells."""
+ROUNDS: Final = 2
+"""Maximum number of times that each of several discs is improved in a search."""
 MOST: Final = 4
 """Number of discs at which the search is abandoned. Loads that require this many discs are not local."""
 WIDE: Final = 3.0
@@ -265,11 +267,33 @@ class _Search:
         """Return the discs with the largest evidence near ``discs``."""
         self._near(discs[:, :2], np.exp(discs[:, 2]) + REACH)
         for _ in range(EXTENSIONS):
-            discs, self.evidence = self._climb(discs, self._effects)
+            discs = self._improved(discs)
             known = self._cells.size
             self._near(discs[:, :2], np.exp(discs[:, 2]) + EDGE)
             if self._cells.size == known:
                 break
+        return discs
+
+    def _improved(self, discs: Float) -> Float:
+        """Return the discs after a search that uses only the cells whose effects have been computed.
+
+        Several discs are improved in turn, each given the others.
+        """
+        p = self._p
+        if len(discs) == 1:
+            discs, self.evidence = self._climb(discs, self._effects)
+            return discs
+        discs = discs.copy()
+        for _ in range(ROUNDS):
+            before = discs.copy()
+            for d in range(len(discs)):
+                own = self._near(discs[[d], :2], np.exp(discs[[d], 2]) + REACH)
+                effects = self._given(np.delete(discs, d, axis=0), own)
+                discs[[d]], _ = self._climb(discs[[d]], effects)
+            if (discs == before).all():
+                break
+        self.evidence = kernels.evidence(discs, self._effects, p._scratch)
+        self.evidence += kernels.log_prior(discs, p._amplitude)
         return discs
 
     def _climb(self, discs: Float, effects: Effects) -> tuple[Float, float]:

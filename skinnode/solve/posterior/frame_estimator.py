@@ -340,16 +340,19 @@ class FrameEstimator:
         touched = self._gate.touched(at_rest, observation.count, self._members)
         # if no wire seems touched, use all wires to be sure
         wanted = touched if self.options.hold and touched.size else self._wires
-        seen, near = readings.usable, False  # near: a field of fewer wires has been found with discs
-        for _ in range(LEFT_OUT + 3):
+        seen = readings.usable
+        for attempt in range(LEFT_OUT + 4):
             members = wanted[observation.count[wanted] > 0]
-            near = near and self._estimator.track(observation, members)
-            if not (near or self._converge(observation, members)):
+            if not self._converge(observation, members):
                 lost = [u for u in members.tolist() if not self._converge(observation, np.array([u]))]
                 if not lost or len(lost) > min(LEFT_OUT, len(status) - 1):
                     return self._give_up(Status.MAX_STEPS)
                 status[lost], readings = Status.MAX_STEPS, readings.without(lost)
                 observation = self._observe(readings)
+                continue
+            early = self._joining_early(observation, wanted) if attempt == 0 else self._wires[:0]
+            if early.size:
+                wanted = np.union1d(wanted, early)
                 continue
             observation = self._refine(observation, readings, members, local=touched.size > 0)
             if not np.isfinite(self._estimator.moved).all():
@@ -357,9 +360,8 @@ class FrameEstimator:
             fit = self._estimator.fit(observation, self._estimator.moved)
             joining = self._joining(fit, observation, wanted)
             if joining.size:
-                wanted, near = np.union1d(wanted, joining), self._hyper.keep_discs()
+                wanted = np.union1d(wanted, joining)
                 continue
-            near = False
             if self._beyond_prior(observation, roots.BELIEVABLE):
                 return self._give_up(Status.INCONSISTENT)
             excess = self._gate.excess(fit, observation.count)
@@ -372,11 +374,19 @@ class FrameEstimator:
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
         """Return the wires outside ``wanted`` that contradict the field, and add them to later estimates."""
-        moved = self._gate.moved(fit, observation.count)
-        moved[wanted] = False
-        joining = np.flatnonzero(moved)
+        joining = np.setdiff1d(np.flatnonzero(self._gate.moved(fit, observation.count)), wanted)
         self._gate.keep(joining)
         return joining
+
+    def _joining_early(self, observation: Observation, wanted: Index) -> Index:
+        """Return the wires outside ``wanted`` that contradict an annealed field, if discs are fitted to it.
+
+        If these wires joined only when the discs had been fitted, the discs would be fitted again.
+        """
+        if not self._annealed or self._hyper.discs is None:
+            return self._wires[:0]
+        fit = self._estimator.fit(observation, self._estimator.moved)
+        return np.setdiff1d(np.flatnonzero(self._gate.moved(fit, observation.count)), wanted)
 
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask

@@ -124,12 +124,6 @@ class Hyperparameters:
         if self.discs is not None:
             self.discs.reset()
 
-    def keep_discs(self) -> bool:
-        """Return whether discs are in use, to be fitted again in the next solve, which uses more wires."""
-        kept = self.discs is not None and len(self.discs.discs) > 0
-        self._rough = self._rough or kept
-        return kept
-
     def is_outdated(self, core: Float) -> bool:
         """Return whether the field has moved so far that :meth:`adapt` will fit the discs again.
 

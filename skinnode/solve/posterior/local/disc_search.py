@@ -24,6 +24,7 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.load_cells import MARGIN
 from skinnode.solve.posterior.local import discs as kernels
 from skinnode.solve.posterior.local.discs import LOADS, PARAMETERS, STEPS, Effects
+from skinnode.solve.posterior.local.load_effects import LoadEffects, Room
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
@@ -59,6 +60,9 @@ deviations from discs would be too small."""
 PAYS: Final = 2.0
 """Minimum gain in log evidence for adding another disc, in excess of the logarithm of the number of
 parameters."""
+YIELDS: Final = 1.0
+"""Further gain that is expected when the other discs yield to a new one. If the gain misses the minimum by no
+more than this, it is computed with all discs."""
 NOTICED: Final = 8.0
 """Minimum squared match between a load and the remaining data at which another disc is tried, in noise
 variances."""
@@ -102,8 +106,7 @@ class DiscPrior:
         near = 1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0)))
         self._near = np.asarray(near)
         self._scratch = kernels.make_scratch(len(self._place))
-        loads = LOADS * len(self._place)
-        self._gram, self._rows_t = np.empty((loads, loads)), np.empty(loads * estimator.equations)
+        self._room = Room.of(len(self._place), estimator.equations)
         own = self._prior.response.reshape(len(layer), -1, 3)
         response = np.concatenate([own, layer[..., None]], axis=2).reshape(len(layer), -1)
         self.response_t = np.ascontiguousarray(response.T)
@@ -182,11 +185,7 @@ class _Search:
 
     def __init__(self, prior: DiscPrior, data: Float, *, everywhere: bool) -> None:
         self._p, self._data, self._everywhere = prior, data, everywhere
-        self._estimator = prior._estimator
-        self._cells: Index = np.arange(0)  # cells whose effects have been computed
-        self._position = np.full(len(prior._place), -1)  # of each cell among these
-        self._rows_t = np.empty((0, len(data)))
-        self._effects = Effects(np.empty((0, 2)), prior._gram, np.empty(0), 0.0)
+        self._loads = LoadEffects(prior._estimator, prior._place, prior.response_t, data, prior._room)
         self._unit = np.zeros(2)
         self.evidence = 0.0
 
@@ -210,10 +209,8 @@ class _Search:
             return np.empty((0, 2)), False
         left = self._data
         if len(discs):
-            q = np.empty(self._effects.match.size)
-            kernels.mean_loads(discs, self._effects, p._scratch, q)
-            left = left - q @ self._rows_t
-        matches, places = np.abs(self._estimator.match(left, p._probes)).reshape(2, -1), p._place[p._inside]
+            left = left - self._loads.mean(discs, p._scratch)[0] @ self._loads.rows_t
+        matches, places = np.abs(p._estimator.match(left, p._probes)).reshape(2, -1), p._place[p._inside]
         best, beyond = np.argmax(matches, axis=1), True
         if len(discs):
             noticed = matches[[0, 1], best] ** 2 >= NOTICED * self._unit
@@ -228,14 +225,14 @@ class _Search:
     def with_disc_at(self, places: Float, discs: Float, *, beyond: bool) -> tuple[Float, float]:
         """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence.
 
-        The other discs are changed only if the new disc pays. If ``places`` are not ``beyond`` the discs, no
+        The other discs change only if the new disc may pay. If ``places`` are not ``beyond`` the discs, no
         further cells are used.
         """
         p, before = self._p, self.evidence
-        own = self._near(places, np.full(len(places), kernels.RADIUS + REACH), include=beyond)
+        own = self._loads.near(places, np.full(len(places), kernels.RADIUS + REACH), include=beyond)
         if not len(discs):
             self._set_unit(places[0])
-        effects = self._given(discs, own) if len(discs) else self._effects
+        effects = self._loads.given(discs, own, p._scratch) if len(discs) else self._loads.effects
         trials = [
             np.array([[*place, math.log(radius), p._amplitude + more, math.log(layer)]])
             for place in places
@@ -249,7 +246,7 @@ class _Search:
         else:
             more, gain = self._climb(first, effects)
             found = np.vstack([discs, more])
-            if gain > PAYS + math.log(PARAMETERS * len(found)):
+            if gain > PAYS + math.log(PARAMETERS * len(found)) - YIELDS:
                 found = self._fitted(found)
                 gain = self.evidence - before
         if not gain > PAYS + math.log(PARAMETERS * len(found)):
@@ -258,19 +255,20 @@ class _Search:
 
     def _set_unit(self, place: Float) -> None:
         """Compute the noise variance of the matches of loads like those at ``place``."""
-        p = self._p
-        near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._cells]
-        self._unit[0] = ((near @ self._rows_t[2::LOADS]) ** 2).sum()
-        self._unit[1] = (self._rows_t[3::LOADS] ** 2).sum(axis=1).max()
+        p, rows_t = self._p, self._loads.rows_t
+        near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._loads.cells]
+        self._unit[0] = ((near @ rows_t[2::LOADS]) ** 2).sum()
+        self._unit[1] = (rows_t[3::LOADS] ** 2).sum(axis=1).max()
 
     def _fitted(self, discs: Float) -> Float:
         """Return the discs with the largest evidence near ``discs``."""
-        self._near(discs[:, :2], np.exp(discs[:, 2]) + REACH)
+        loads = self._loads
+        loads.near(discs[:, :2], np.exp(discs[:, 2]) + REACH)
         for _ in range(EXTENSIONS):
             discs = self._improved(discs)
-            known = self._cells.size
-            self._near(discs[:, :2], np.exp(discs[:, 2]) + EDGE)
-            if self._cells.size == known:
+            known = loads.cells.size
+            loads.near(discs[:, :2], np.exp(discs[:, 2]) + EDGE)
+            if loads.cells.size == known:
                 break
         return discs
 
@@ -279,20 +277,20 @@ class _Search:
 
         Several discs are improved in turn, each given the others.
         """
-        p = self._p
+        p, loads = self._p, self._loads
         if len(discs) == 1:
-            discs, self.evidence = self._climb(discs, self._effects)
+            discs, self.evidence = self._climb(discs, loads.effects)
             return discs
         discs = discs.copy()
         for _ in range(ROUNDS):
             before = discs.copy()
             for d in range(len(discs)):
-                own = self._near(discs[[d], :2], np.exp(discs[[d], 2]) + REACH)
-                effects = self._given(np.delete(discs, d, axis=0), own)
-                discs[[d]], _ = self._climb(discs[[d]], effects)
+                own = loads.near(discs[[d], :2], np.exp(discs[[d], 2]) + REACH)
+                others = np.delete(discs, d, axis=0)
+                discs[[d]], _ = self._climb(discs[[d]], loads.given(others, own, p._scratch))
             if (discs == before).all():
                 break
-        self.evidence = kernels.evidence(discs, self._effects, p._scratch)
+        self.evidence = kernels.evidence(discs, loads.effects, p._scratch)
         self.evidence += kernels.log_prior(discs, p._amplitude)
         return discs
 
@@ -302,88 +300,34 @@ class _Search:
         evidence = kernels.climb(found, effects, p._amplitude, p._bounds, work, p._scratch)
         return found, evidence
 
-    def _near(self, places: Float, reach: Float, *, include: bool = True) -> Index:
-        """Return the positions of the cells within ``reach`` (P,) of ``places`` (P, 2).
-
-        If ``include`` is true, the effects of loads on these cells are computed unless they are known.
-        """
-        place, reach = self._p._place, np.minimum(reach, WIDE + REACH)
-        square = ((place[:, None] - places) ** 2).sum(axis=-1)
-        near = np.flatnonzero((square <= reach**2).any(axis=1))
-        fresh = near[self._position[near] < 0]
-        if fresh.size and include:
-            self._position[fresh] = self._cells.size + np.arange(fresh.size)
-            self._add(fresh)
-        positions = self._position[near]
-        return positions[positions >= 0]
-
-    def _add(self, fresh: Index) -> None:
-        """Compute the effects of loads on the cells ``fresh``."""
-        p, old, gram = self._p, len(self._rows_t), self._effects.gram
-        response = np.ascontiguousarray(p.response_t[_loads_of(fresh)].T)
-        rows = np.empty((len(self._data), response.shape[1]))
-        self._estimator.whiten(response, rows)
-        self._cells = np.concatenate([self._cells, fresh])
-        size, m = old + response.shape[1], len(self._data)
-        self._rows_t = p._rows_t[: size * m].reshape(size, m)
-        self._rows_t[old:] = rows.T
-        strip = np.empty((size, response.shape[1]))
-        multiply(self._rows_t, rows, strip)
-        gram[:size, old:size] = strip
-        gram[old:size, :old] = strip[:old].T
-        match = np.concatenate([self._effects.match, self._data @ rows])
-        self._effects = Effects(p._place[self._cells], gram, match, 0.0)
-
-    def _given(self, discs: Float, own: Index) -> Effects:
-        """Return the effects of the cells at positions ``own`` on what ``discs`` leave of the data."""
-        p, effects, loads = self._p, self._effects, LOADS * own.size
-        cross, gram, explained = np.empty((effects.match.size, loads)), *np.empty((2, loads, loads))
-        match = np.empty(loads)
-        count = kernels.whiten_by_discs(discs, effects, own, p._scratch, cross, gram, match)
-        cross = cross[: max(count, 0)]
-        multiply(np.ascontiguousarray(cross.T), cross, explained)
-        gram -= explained
-        match -= p._scratch.vector[: len(cross)] @ cross
-        strongest = float(np.exp(2.0 * discs[:, 3]).max())
-        return Effects(effects.place[own], gram, match, strongest)
-
-    def _response_t(self) -> Float:
-        """Return the displacement (4n, U f) per unit load on the cells whose effects have been computed."""
-        return np.asarray(self._p.response_t[_loads_of(self._cells)])
-
     def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
         """Add the variance due to a rejected disc that may nevertheless exist."""
-        p, effects = self._p, self._effects
-        own, other = np.empty((2, effects.match.size))
-        kernels.mean_loads(discs, effects, p._scratch, own)
-        kernels.mean_loads(more, effects, p._scratch, other)
+        p, loads = self._p, self._loads
+        change = loads.mean(more, p._scratch)[0] - loads.mean(discs, p._scratch)[0]
         chance = 1.0 / (1.0 + math.exp(-excess))
-        p.spread += chance * (1.0 - chance) * ((other - own) @ self._response_t()) ** 2
+        p.spread += chance * (1.0 - chance) * (change @ loads.response_t()) ** 2
 
     def measure_spread(self, discs: Float) -> None:
         """Add the variance of the displacement due to the uncertainty of each disc parameter.
 
         The displacement is averaged over three values of the parameter, weighted by their evidence.
         """
-        p, effects = self._p, self._effects
-        own, others = np.empty(effects.match.size), np.empty((2 * discs.size, effects.match.size))
-        best = kernels.mean_loads(discs, effects, p._scratch, own) + kernels.log_prior(discs, p._amplitude)
-        weight = np.ones((discs.size, 3))
-        for i in range(2 * discs.size):
-            trial = discs.copy()
-            trial.ravel()[i // 2] += (1.0, -1.0)[i % 2] * STEPS[i // 2 % PARAMETERS]
-            found = kernels.mean_loads(trial, effects, p._scratch, others[i])
-            found += kernels.log_prior(trial, p._amplitude)
-            weight[i // 2, 1 + i % 2] = math.exp(min(found - best, 0.0))
+        p, loads = self._p, self._loads
+        own, best = loads.mean(discs, p._scratch)
+        best += kernels.log_prior(discs, p._amplitude)
+        weight, change = np.ones((discs.size, 3)), np.empty((discs.size, 2, own.size))
+        for i in range(discs.size):
+            for side, sign in enumerate((1.0, -1.0)):
+                trial = discs.copy()
+                trial.ravel()[i] += sign * STEPS[i % PARAMETERS]
+                other, found = loads.mean(trial, p._scratch)
+                found += kernels.log_prior(trial, p._amplitude)
+                change[i, side] = other - own
+                weight[i, 1 + side] = math.exp(min(found - best, 0.0))
         weight /= weight.sum(axis=1, keepdims=True)
+        moved = np.empty((2 * discs.size, len(p.spread)))
+        multiply(change.reshape(len(moved), -1), loads.response_t(), moved)
         shift = np.zeros((discs.size, 3, len(p.spread)))
-        moved = np.empty((len(others), len(p.spread)))
-        multiply(others - own, self._response_t(), moved)
         shift[:, 1:] = moved.reshape(discs.size, 2, -1)
         shift -= np.einsum("pi,piu->pu", weight, shift)[:, None]
         p.spread += np.einsum("pi,piu->u", weight, shift**2)
-
-
-def _loads_of(cells: Index) -> Index:
-    """Return the indices of the loads of ``cells``."""
-    return np.asarray((LOADS * cells[:, None] + np.arange(LOADS)).ravel())

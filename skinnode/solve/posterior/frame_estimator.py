@@ -419,9 +419,12 @@ class FrameEstimator:
         self._annealed = False
         hurry = self._seconds < math.inf  # annealing takes as long as several normal solves
         core = estimator.core.copy()
-        if (self._known or hurry) and estimator.track(
-            observation, members, lambda: self._hyper.is_outdated(core)
-        ):
+
+        def is_near_enough() -> bool:
+            step = float(np.abs(estimator.moved - self._trusted).max())
+            return step < self._far and self._hyper.is_outdated(core)
+
+        if (self._known or hurry) and estimator.track(observation, members, is_near_enough):
             gone = float(np.abs(estimator.moved - self._compared).max())
             far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
             if not far or hurry or self._anneal_and_compare(observation, members):
@@ -435,8 +438,8 @@ class FrameEstimator:
 
         This method is called after a large movement, because tracking can then end at a wrong maximum. The
         annealed field expects equal loads over the whole patch. With discs, it is therefore compared with the
-        maximum that the tracked field leads to under the same prior, and discarded unless it is clearly more
-        likely; the discs remain in use.
+        maximum near the tracked field under the same prior. Unless it is clearly more likely, the discs stay
+        in use, and are fitted to data linearised at that maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
@@ -449,7 +452,6 @@ class FrameEstimator:
             estimator.moved[:], estimator.g[:] = tracked
             near = estimator.track(observation, members)
             if near and estimator.objective(observation) <= least + roots.LIKELIER:
-                estimator.moved[:], estimator.g[:] = tracked
                 self._hyper.return_to(discs)
                 return True
             estimator.moved[:], estimator.g[:] = other

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.cholesky import multiply
+from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.local import discs as kernels
 from skinnode.solve.posterior.local.discs import LOADS, Effects, Scratch
@@ -77,12 +77,14 @@ class LoadEffects:
         """Return the effects of the cells at positions ``own`` on what ``discs`` leave of the data."""
         effects, loads = self.effects, LOADS * own.size
         cross, gram, explained = np.empty((effects.match.size, loads)), *np.empty((2, loads, loads))
-        match = np.empty(loads)
+        match, known = np.empty((2, loads))
         count = kernels.whiten_by_discs(discs, effects, own, scratch, cross, gram, match)
         cross = cross[: max(count, 0)]
-        multiply(np.ascontiguousarray(cross.T), cross, explained)
+        cross_t = np.ascontiguousarray(cross.T)
+        multiply(cross_t, cross, explained)
+        multiply_vector(cross_t, scratch.vector[: len(cross)], known)
         gram -= explained
-        match -= scratch.vector[: len(cross)] @ cross
+        match -= known
         strongest = float(np.exp(2.0 * discs[:, 3]).max())
         return Effects(effects.place[own], gram, match, strongest)
 
@@ -107,7 +109,9 @@ class LoadEffects:
         self.rows_t[old:] = rows.T
         multiply(self.rows_t, rows, products)
         gram[:size, old:size], gram[old:size, :old] = products, products[:old].T
-        match = np.concatenate([self.effects.match, self._data @ rows])
+        match = np.empty(size)
+        match[:old] = self.effects.match
+        multiply_vector(self.rows_t[old:], self._data, match[old:])
         self.effects = Effects(self._place[self.cells], gram, match, 0.0)
 
 

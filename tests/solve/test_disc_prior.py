@@ -52,12 +52,26 @@ def test_mean_loads_are_those_of_dense_regression():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
+def test_effects_given_discs_are_those_of_data_whitened_for_the_discs():
+    data, rows, variance, effects = problem(6)
+    own, scratch = np.array([2, 5, 11]), discs.make_scratch(len(PLACE))
+    size = LOADS * len(own)
+    cross, gram, match = np.empty((rows.shape[1], size)), np.empty((size, size)), np.empty(size)
+    count = discs.whiten_by_discs(DISCS, effects, own, scratch, cross, gram, match)
+    gram -= cross[:count].T @ cross[:count]
+    match -= scratch.vector[:count] @ cross[:count]
+    own_rows = rows[:, (LOADS * own[:, None] + np.arange(LOADS)).ravel()]
+    left = np.linalg.inv(np.eye(30) + (rows * variance) @ rows.T) @ np.column_stack([own_rows, data])
+    np.testing.assert_allclose(gram, own_rows.T @ left[:, :-1], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(match, own_rows.T @ left[:, -1], rtol=1e-8, atol=1e-10)
+
+
 def test_the_search_finds_no_worse_discs_than_those_it_starts_from():
     _, _, _, effects = problem(7)
     scratch, found = discs.make_scratch(len(PLACE)), DISCS + 0.4
     bounds = np.array([[0.0, 0.0, -1.0, -5.0, -3.0], [2.0, 3.0, 1.3, 2.0, 1.5]])
     before = discs.evidence(found, effects, scratch) + discs.log_prior(found, 0.0)
-    top = discs.climb(found, 0, effects, 0.0, bounds, found.copy(), scratch)
+    top = discs.climb(found, effects, 0.0, bounds, np.empty((3, *found.shape)), scratch)
     assert top == pytest.approx(discs.evidence(found, effects, scratch) + discs.log_prior(found, 0.0))
     assert top > before
     assert (found >= bounds[0]).all()
@@ -252,8 +266,8 @@ def test_discs_are_fitted_again_as_earlier_frames_reduce_the_noise_of_a_held_pre
         assert (error <= 5.0 * held.displacement_std_m).all()
         released = auto.update(skin.rest_ohm * (1 + sigma * random.standard_normal(ohm.shape)))
         assert (np.abs(released.displacement_m) <= 5.0 * released.displacement_std_m).all()
-    assert np.mean(errors["auto"]) < 0.65 * np.mean(errors["off"])
-    assert np.mean(errors["auto"]) < 1.25 * np.mean(errors["mean"])
+    assert np.mean(errors["auto"]) < 0.7 * np.mean(errors["off"])
+    assert np.mean(errors["auto"]) < 1.2 * np.mean(errors["mean"])
     assert inside > 0.92 * count
 
 

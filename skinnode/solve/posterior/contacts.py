@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -60,6 +61,9 @@ class LoadEstimate:
     """Squared scale s² of the prior, in pitch²."""
     doubt: float = PRIOR_DOUBT
     """Factor applied to the variances, because the loads depend mainly on the prior."""
+    add_shear: Callable[[Index], None] | None = None
+    """Function that computes the columns of ``rows`` for the shear loads of given cells; None if ``rows`` is
+    complete. Only the shear loads of the cells in contacts are needed."""
 
 
 class ContactFinder:
@@ -144,6 +148,8 @@ class ContactFinder:
             self._has_electrode, self._near, self._before, self._number, self._outside,
             self._scratch,
         )  # fmt: skip
+        if loads.add_shear is not None:
+            loads.add_shear(np.flatnonzero((self._number > 0) | (self._outside > 0)))
         found = [self._contact(number, loads) for number in range(1, count + 1)]
         found.sort(key=lambda contact: -contact.normal_force_n)
         return force, tuple(found)

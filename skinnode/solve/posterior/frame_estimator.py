@@ -341,7 +341,7 @@ class FrameEstimator:
         # if no wire seems touched, use all wires to be sure
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
-        for _ in range(LEFT_OUT + 3):
+        for attempt in range(LEFT_OUT + 4):
             members = wanted[observation.count[wanted] > 0]
             if not self._converge(observation, members):
                 lost = [u for u in members.tolist() if not self._converge(observation, np.array([u]))]
@@ -349,6 +349,10 @@ class FrameEstimator:
                     return self._give_up(Status.MAX_STEPS)
                 status[lost], readings = Status.MAX_STEPS, readings.without(lost)
                 observation = self._observe(readings)
+                continue
+            early = self._joining_early(observation, wanted) if attempt == 0 else self._wires[:0]
+            if early.size:
+                wanted = np.union1d(wanted, early)
                 continue
             observation = self._refine(observation, readings, members, local=touched.size > 0)
             if not np.isfinite(self._estimator.moved).all():
@@ -370,11 +374,19 @@ class FrameEstimator:
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
         """Return the wires outside ``wanted`` that contradict the field, and add them to later estimates."""
-        moved = self._gate.moved(fit, observation.count)
-        moved[wanted] = False
-        joining = np.flatnonzero(moved)
+        joining = np.setdiff1d(np.flatnonzero(self._gate.moved(fit, observation.count)), wanted)
         self._gate.keep(joining)
         return joining
+
+    def _joining_early(self, observation: Observation, wanted: Index) -> Index:
+        """Return the wires outside ``wanted`` that contradict an annealed field, if discs are fitted to it.
+
+        If these wires joined only when the discs had been fitted, the discs would be fitted again.
+        """
+        if not self._annealed or self._hyper.discs is None:
+            return self._wires[:0]
+        fit = self._estimator.fit(observation, self._estimator.moved)
+        return np.setdiff1d(np.flatnonzero(self._gate.moved(fit, observation.count)), wanted)
 
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask
@@ -406,7 +418,13 @@ class FrameEstimator:
         estimator.g[:] = self._trusted_g
         self._annealed = False
         hurry = self._seconds < math.inf  # annealing takes as long as several normal solves
-        if (self._known or hurry) and estimator.track(observation, members):
+        core = estimator.core.copy()
+
+        def is_near_enough() -> bool:
+            step = float(np.abs(estimator.moved - self._trusted).max())
+            return step < self._far and self._hyper.is_outdated(core)
+
+        if (self._known or hurry) and estimator.track(observation, members, is_near_enough):
             gone = float(np.abs(estimator.moved - self._compared).max())
             far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
             if not far or hurry or self._anneal_and_compare(observation, members):
@@ -418,16 +436,28 @@ class FrameEstimator:
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
         """Anneal from rest, and keep the tracked or the annealed field, whichever is more likely.
 
-        This method is called after a large movement, because tracking can then end at a wrong maximum.
+        This method is called after a large movement, because tracking can then end at a wrong maximum. The
+        annealed field expects equal loads over the whole patch. With discs, it is therefore compared with the
+        maximum near the tracked field under the same prior. Unless it is clearly more likely, the discs stay
+        in use, and are fitted to data linearised at that maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
         tracked = estimator.moved.copy(), estimator.g.copy()
-        self._hyper.spread_as_seen(observation, members)
+        discs = self._hyper.spread_as_seen(observation, members)
         annealed = estimator.anneal(observation, members)
-        self._annealed = annealed and (
-            estimator.objective(observation) <= estimator.objective(observation, *tracked)
-        )
+        least = estimator.objective(observation)
+        if annealed and discs is not None:
+            other = estimator.moved.copy(), estimator.g.copy()
+            estimator.moved[:], estimator.g[:] = tracked
+            near = estimator.track(observation, members)
+            if near and estimator.objective(observation) <= least + roots.LIKELIER:
+                self._hyper.return_to(discs)
+                return True
+            estimator.moved[:], estimator.g[:] = other
+            self._annealed = estimator.track(observation, members)
+            return self._annealed
+        self._annealed = annealed and least <= estimator.objective(observation, *tracked)
         if self._annealed:
             return True
         estimator.moved[:], estimator.g[:] = tracked

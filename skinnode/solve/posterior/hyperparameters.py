@@ -100,8 +100,10 @@ class Hyperparameters:
         self._rough = False  # whether the discs were fitted only to a field estimated with the uniform prior
         self._fitted = np.zeros_like(estimator.moved)  # displacement to which the discs were fitted
         self._fitted_power = math.inf  # sum of 1/noise² over the readings to which the discs were fitted
+        self._outdated = False  # whether the field has left the discs since it was last fitted
         self._rejected = math.inf  # largest displacement over noise when no discs were found
         self._may_retry = False  # whether this happened in an earlier frame
+        self._disc_loads = np.empty((2, 0)), 0.0  # load variances of the discs, and of untouched skin
         self._fixed, self._clearance = scale2, clearance
         self._estimate_noise = estimate_noise
         self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
@@ -118,8 +120,21 @@ class Hyperparameters:
         self._forget_discs()
 
     def _forget_discs(self) -> None:
+        self._outdated = False
         if self.discs is not None:
             self.discs.reset()
+
+    def is_outdated(self, core: Float) -> bool:
+        """Return whether the field has moved so far that :meth:`adapt` will fit the discs again.
+
+        Args:
+            core: (U, f) standard deviations of the last field for the 95 % interval, in pitches.
+        """
+        moved = self._estimator.moved
+        change, top = float(np.abs(moved - self._fitted).max()), float(np.abs(moved).max())
+        in_use = self.discs is not None and len(self.discs.discs) > 0
+        self._outdated = in_use and self._has_moved(change, top, core)
+        return self._outdated
 
     def with_discs(self, std: Float, core: Float) -> tuple[Float, Float]:
         """Return ``std`` and ``core`` (U, f), in pitches, including the uncertainty of the discs.
@@ -162,11 +177,27 @@ class Hyperparameters:
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
-    def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads over the whole patch, at a scale estimated from the frame with the old prior."""
+    def spread_as_seen(self, observation: Observation, members: Index) -> Float | None:
+        """Expect equal loads over the whole patch, at a scale estimated from the frame with the old prior.
+
+        Returns:
+            The discs in use, for :meth:`return_to`; None if there are none.
+        """
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
+        discs = None if self.discs is None or not len(self.discs.discs) else self.discs.discs
         self._forget_discs()
         self._prior.spread(guess)
+        return discs
+
+    def return_to(self, discs: Float) -> None:
+        """Return to the prior before :meth:`spread_as_seen`.
+
+        The next fit starts at the strongest disc alone, so that others are used only if they still pay.
+        """
+        assert self.discs is not None
+        self.discs.discs = discs[[np.argmax(discs[:, 3])]]
+        self._set_discs()
+        self._rough = True
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
@@ -244,22 +275,33 @@ class Hyperparameters:
         top = float(np.abs(estimator.moved).max())
         power = float((observation.weight**2).sum())
         same_noise = REFIT_NOISE**2 <= power / self._fitted_power <= REFIT_NOISE**-2
-        moved = change >= REFIT * top + NOISY * float(estimator.core.max())
-        if same_noise and not (uniform or self._rough or moved):
+        known = uniform or self._rough or self._outdated
+        if same_noise and not (known or self._has_moved(change, top, estimator.core)):
             return False
+        self._outdated = False
         self._fitted[:], self._fitted_power = estimator.moved, power
         strongest = float(np.exp(2.0 * discs.discs[:, 3]).max()) if len(discs.discs) else 0.0
         untouched2 = max(UNTOUCHED * self._least, FAR_LOADS**2 * strongest)
         everywhere2 = prior.scale2 if uniform else self._expected
-        variance = discs.fit(observation, members, untouched2, everywhere2, spread=not uniform)
+        variance = discs.fit(observation, members, untouched2, everywhere2, everywhere=uniform or self._rough)
         self._rough = uniform
         if variance is None:
             self._rejected, self._may_retry = top * math.sqrt(power), False
             prior.spread(everywhere2)
             estimator.track(observation, members)
             return self._set_scale(local=True, refine=True)
-        prior.set_discs(np.minimum(variance, self._most), discs.layer, untouched2)
+        self._disc_loads = np.minimum(variance, self._most), untouched2
+        self._set_discs()
         return True
+
+    def _set_discs(self) -> None:
+        assert self.discs is not None
+        variance, untouched2 = self._disc_loads
+        self._prior.set_discs(variance, self.discs.response_t, untouched2)
+
+    def _has_moved(self, change: float, top: float, core: Float) -> bool:
+        """Return whether the field has moved by more than the noise since the discs were fitted."""
+        return change >= REFIT * top and change >= REFIT * top + NOISY * float(core.max())
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
         """Estimate the scale and the load locations from the evidence; return whether the prior changed."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.contacts import LoadEstimate
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
@@ -40,13 +41,19 @@ class LoadPosterior:
     def reset(self) -> None:
         """Free the memory used by the last frame's covariance."""
         self._whitened = np.empty((0, self._stiffness.size))
-        self._factors = -1  # serial number of the factors to which the cached arrays belong
+        self._factors = -1  # serial number of the factors to which the cached columns belong
+        self._known = np.zeros(self._stiffness.size, bool)  # columns that have been computed
+        self._stiffness_known = False
 
     def estimate(self) -> LoadEstimate:
         """Return the loads and their covariance. The arrays are valid until the next frame."""
-        rows, prior = self._whiten(), self._prior
+        prior, rows = self._prior, self._rows()
+        if not self._known[2::3].all():
+            normal = np.empty((len(rows), len(prior.share)))
+            self._estimator.whiten(prior.normal_response, normal)
+            rows[:, 2::3], self._known[2::3] = normal, True
         ones = self._ones[: len(rows)]
-        return LoadEstimate(self.mean(), rows, ones, prior.share, prior.scale2, prior.doubt)
+        return LoadEstimate(self.mean(), rows, ones, prior.share, prior.scale2, prior.doubt, self._add_shear)
 
     def mean(self) -> Float:
         """Return the mean loads (Q, 3) for the current displacement, in units of the prior's loads."""
@@ -68,13 +75,32 @@ class LoadPosterior:
 
     def _whiten(self) -> Float:
         """Return L⁻¹ J G (m, 3Q) for the current factors, and update the sensitivity k to each load."""
-        if self._factors != self._estimator.factors:
-            self._factors = self._estimator.factors
-            if not self._whitened.size:
-                self._whitened = np.empty((self._estimator.equations, self._stiffness.size))
-            rows = self._whitened[: self._estimator.factored_rows]
+        rows = self._rows()
+        if not self._stiffness_known:
             self._estimator.whiten(self._prior.response, rows)
+            self._known[:] = self._stiffness_known = True
             self._stiffness[:] = np.maximum(np.einsum("mq,mq->q", rows, rows), 1e-300)
+        return rows
+
+    def _add_shear(self, cells: Index) -> None:
+        """Add the shear loads of ``cells`` to the covariance of the last :meth:`estimate`."""
+        fresh = cells[~self._known[3 * cells]]
+        if not fresh.size:
+            return
+        rows, response_t = self._rows(), self._prior.response_t
+        some = response_t.reshape(-1, 3, response_t.shape[1])[fresh, :2].reshape(2 * fresh.size, -1)
+        shear = np.empty((len(rows), len(some)))
+        self._estimator.whiten(np.ascontiguousarray(some.T), shear)
+        rows.reshape(len(rows), -1, 3)[:, fresh, :2] = shear.reshape(len(rows), -1, 2)
+        self._known[3 * fresh] = self._known[3 * fresh + 1] = True
+
+    def _rows(self) -> Float:
+        """Return the array (m, 3Q) for L⁻¹ J G; its columns are invalid if the factors have changed."""
+        if not self._whitened.size:
+            self._whitened = np.zeros((self._estimator.equations, self._stiffness.size))
+        if self._factors != self._estimator.factors:
+            self._factors, self._stiffness_known = self._estimator.factors, False
+            self._known[:] = False
         return self._whitened[: self._estimator.factored_rows]
 
 

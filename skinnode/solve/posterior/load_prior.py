@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 
+from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.cholesky import (
     cholesky,
@@ -71,6 +72,8 @@ class UniformPrior:
     """(U f, 3Q) displacement per unit load, in pitches."""
     response_t: Float
     """(3Q, U f) transposed response."""
+    normal: Float
+    """(U f, Q) columns of ``response`` that belong to normal loads."""
     covariance: Float
     """(U f, U f) matrix C, in pitch²."""
     root: Float
@@ -93,7 +96,8 @@ def _uniform_prior(elastic: ElasticPrior, free_bytes: bytes) -> UniformPrior:
     root = covariance.copy()
     cholesky(root, len(root))
     response_t = np.ascontiguousarray(response.T)
-    return UniformPrior(response, response_t, covariance, root, _blur(elastic.shape))
+    normal = np.ascontiguousarray(response[:, 2::3])
+    return UniformPrior(response, response_t, normal, covariance, root, _blur(elastic.shape))
 
 
 class LoadPrior:
@@ -111,6 +115,8 @@ class LoadPrior:
         covariance: (U f, U f) matrix C; read-only.
         uniform: (U f, U f) matrix C for equal expected loads over the whole patch; read-only.
         response: (U f, 3Q) displacement per unit load, in pitches.
+        response_t: (3Q, U f) transposed response.
+        normal_response: (U f, Q) displacement per unit of normal load, in pitches.
         doubt: Factor applied to the part of the variance that depends on the prior.
         smooth_share: Value of ``doubt`` for the 95 % interval.
         version: Number of times C has been rebuilt.
@@ -119,7 +125,7 @@ class LoadPrior:
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
         self._of_layout = UniformPrior.of(elastic, free)
         self.response, self.uniform = self._of_layout.response, self._of_layout.covariance
-        self.response_t = self._of_layout.response_t
+        self.response_t, self.normal_response = self._of_layout.response_t, self._of_layout.normal
         self.covariance, self._root = self.uniform, self._of_layout.root
         self.doubt, self.smooth_share = PRIOR_DOUBT, SMOOTH_SHARE
         self.scale2 = 1.0
@@ -158,13 +164,14 @@ class LoadPrior:
         self._factorise()
         return True
 
-    def set_discs(self, variance: Float, layer: Float, untouched2: float) -> None:
+    def set_discs(self, variance: Float, response_t: Float, untouched2: float) -> None:
         """Set the load variances for a skin that is untouched except for discs on a few cells.
 
         Args:
             variance: (2, Q) variances that discs add to the half-space and layer loads of each cell, in
                 pitch².
-            layer: (U f, Q) displacement per unit load on a bonded layer, in pitches.
+            response_t: (4Q, U f) displacement per unit load, in pitches: for each cell, the three loads on a
+                half-space and the load on a bonded layer.
             untouched2: Variance of the half-space loads on untouched skin, in pitch².
         """
         loaded = variance[0] > DISC_FAINT * untouched2
@@ -172,15 +179,11 @@ class LoadPrior:
         self.scale2 = float(own.mean())
         self.share[:] = own / self.scale2
         rest = untouched2 / self.scale2
-        added = np.column_stack([np.repeat(variance[:1], 3, axis=0).T, variance[1]])[loaded] / self.scale2
-        response = self.response.reshape(len(layer), -1, 3)[:, loaded]
-        part = np.concatenate([response, layer[:, loaded, None]], axis=2).reshape(len(layer), -1)
+        added = np.repeat(variance, (3, 1), axis=0).T[loaded].ravel() / self.scale2
+        part_t = response_t.reshape(len(own), 4, -1)[loaded].reshape(added.size, -1)
         covariance = self._own_covariance()
-        multiply(part * added.ravel(), np.ascontiguousarray(part.T), covariance)
-        near = DISC_SLACK**2 * covariance.diagonal()
-        covariance += rest * self.uniform
-        covariance[np.diag_indices_from(covariance)] += near
-        covariance[np.diag_indices_from(covariance)] += (1.0 - rest) * SLACK**2
+        multiply(np.ascontiguousarray(part_t.T), part_t * added[:, None], covariance)
+        _add_untouched(covariance, self.uniform, rest, DISC_SLACK**2, (1.0 - rest) * SLACK**2)
         self.doubt, self.smooth_share = DISC_DOUBT, DISC_SHARE
         self._factorise()
 
@@ -244,6 +247,17 @@ class LoadPrior:
     def _made_anew(self) -> None:
         self.version += 1
         self._loads = None
+
+
+@njit
+def _add_untouched(c: Float, uniform: Float, rest: float, near: float, slack: float) -> None:
+    """Add ``rest`` times the covariance ``uniform`` to ``c``, and the independent parts to its diagonal."""
+    for i in range(c.shape[0]):
+        row, other = c[i], uniform[i]
+        own = row[i]
+        for j in range(row.size):
+            row[j] += rest * other[j]
+        row[i] += near * own + slack
 
 
 def _blur(shape: tuple[int, int]) -> Float:

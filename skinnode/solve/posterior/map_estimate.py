@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -86,9 +87,6 @@ class MapEstimator:
         load_prior: Prior for the loads and of the displacement.
         moved: (U, 3N) displacement, in pitches; 0 for fixed coordinates.
         g: The p nuisances, followed by the geometry errors.
-        std: (U, f) standard deviations from the last factors, in pitches.
-        core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, in pitches.
-        noise_variance: (U f,) variance of the displacement due to noise and nuisances, in pitch².
         members: Wires whose equations are in the factors.
         factors: Serial number of the current factors.
         evaluations: Number of evaluations of F and its Jacobian, per wire. The caller resets the counter.
@@ -117,7 +115,7 @@ class MapEstimator:
         )
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # convergence tolerance for the RMS of a chord step, in pitches
+        self._enough = math.inf, math.inf  # limits of the convergence tolerance; see _is_enough
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
@@ -126,9 +124,9 @@ class MapEstimator:
         self._correction = np.zeros(wires * free.size + self.g.size)
         self._every = np.arange(wires)
         self.moved = np.zeros((wires, coordinates))
-        self.std = np.full((wires, free.size), np.inf)
-        self.core = np.full((wires, free.size), np.inf)
-        self.noise_variance = np.zeros(wires * free.size)
+        self._std, self._core, self._whole_std = np.full((3, wires, free.size), np.inf)
+        self._noise_variance, self._no_noise = np.zeros((2, wires * free.size))
+        self._unfinished: tuple[Float, float, float] | None = None  # see _measure
         self._gamma: float | None = None
         self.members: Index = np.arange(0)
         self._factored: tuple[Float, float, int] | None = None  # weight, s², version of the prior
@@ -141,6 +139,24 @@ class MapEstimator:
     def equations(self) -> int:
         """Number of equations of all wires after the QR reduction."""
         return len(self._b.v)
+
+    @property
+    def std(self) -> Float:
+        """Standard deviations (U, f) from the last factors, in pitches."""
+        self._finish_measuring()
+        return self._std
+
+    @property
+    def core(self) -> Float:
+        """Standard deviations (U, f) for the 95 % interval, which assume smooth bodies, in pitches."""
+        self._finish_measuring()
+        return self._core
+
+    @property
+    def noise_variance(self) -> Float:
+        """Variance (U f,) of the displacement due to noise and nuisances, in pitch²."""
+        self._finish_measuring()
+        return self._noise_variance
 
     @property
     def factored_rows(self) -> int:
@@ -160,15 +176,24 @@ class MapEstimator:
 
     def forget_factors(self) -> None:
         """Discard the factors and the standard deviations."""
-        self.std[:] = np.inf
-        self.core[:] = np.inf
-        self._enough = math.inf
+        self._std[:] = np.inf
+        self._core[:] = np.inf
+        self._enough = math.inf, math.inf
+        self._unfinished = None
         self._factored = None
 
     # -- solving ---------------------------------------------------------------------------------------
 
-    def track(self, observation: Observation, members: Index) -> bool:
+    def track(
+        self, observation: Observation, members: Index, is_near_enough: Callable[[], bool] = lambda: False
+    ) -> bool:
         """Solve from the current displacement, using the equations of the wires ``members`` (P,).
+
+        Args:
+            observation: The frame.
+            members: Wires whose equations are used.
+            is_near_enough: Function that returns whether a Gauss-Newton step suffices, because the prior will
+                change. In this case, there are no standard deviations.
 
         Returns:
             True if the solve converged; False if it found no maximum nearby.
@@ -182,6 +207,9 @@ class MapEstimator:
             if not size <= self._reach:
                 return False
             self._shorten(observation, *before)
+            if is_near_enough():
+                self.forget_factors()
+                return True
             self._measure(observation)
             if self._settle(observation):
                 return True
@@ -220,6 +248,7 @@ class MapEstimator:
             start = perf_counter()
             self._newton(observation, self._every)
             self._measure(observation)
+            self._finish_measuring()
             least = min(least, perf_counter() - start)
         self.forget_factors()
         return least
@@ -472,21 +501,47 @@ class MapEstimator:
         self.moved[:], self.g[:] = moved + share * way[0], g + share * way[1]
 
     def _measure(self, observation: Observation) -> None:
-        """Compute the standard deviations from the current factors."""
+        """Compute the posterior variances from the current factors.
+
+        The part of the variances that is due to noise is computed when it is needed, because solves that
+        only lead to a better prior do not need it.
+        """
         b, m, prior = self._b, self.factored_rows, self.load_prior
         self._gamma = None
         b.whitened[:m] = b.cross_covariance[:m]
         solve_lower(b.innovation_covariance, b.whitened, m, b.whitened.shape[1])
-        kalman_gain_t = np.empty((m, b.whitened.shape[1]))
-        kernels.noise_variance(m, observation.d, b, kalman_gain_t, self.noise_variance)
-        if self._geometry is not None:
-            out = self.noise_variance
-            geometry_error.add_variance(self.members, b.factored_effect, kalman_gain_t, self._scratch, out)
         kernels.standard_deviations(
-            m, prior.covariance, prior.scale2, self.noise_variance, prior.doubt, prior.smooth_share, self.std,
-            self.core, b,
-        )  # fmt: skip
-        self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
+            m, prior.covariance, prior.scale2, self._no_noise, 1.0, 0.0, self._whole_std, self._core, b
+        )
+        self._unfinished = observation.d, prior.doubt, prior.smooth_share
+        most = SETTLED * math.sqrt(float(np.mean(self._whole_std**2)))
+        self._enough = math.sqrt(prior.smooth_share) * most, most
+
+    def _finish_measuring(self) -> None:
+        """Compute the standard deviations from the posterior variances, unless this has been done."""
+        if self._unfinished is None:
+            return
+        (d, doubt, share), self._unfinished = self._unfinished, None
+        b, m, noise = self._b, self.factored_rows, self._noise_variance
+        kalman_gain_t = np.empty((m, b.whitened.shape[1]))
+        kernels.noise_variance(m, d, b, kalman_gain_t, noise)
+        if self._geometry is not None:
+            geometry_error.add_variance(self.members, b.factored_effect, kalman_gain_t, self._scratch, noise)
+        own = noise.reshape(self._std.shape)
+        unseen = np.maximum(self._whole_std**2 - own, 0.0)
+        np.sqrt(own + doubt * unseen, out=self._std)
+        np.sqrt(own + share * unseen, out=self._core)
+        enough = SETTLED * math.sqrt(float(np.mean(self._core**2)))
+        self._enough = enough, enough
+
+    def _is_enough(self, size: float) -> bool:
+        """Return whether a chord step of RMS ``size``, in pitches, is small compared with :attr:`core`.
+
+        Noise causes between none and all of the variance. ``core`` is computed only if this decides.
+        """
+        if self._enough[0] < size <= self._enough[1]:
+            self._finish_measuring()
+        return size <= self._enough[1]
 
     def _settle(self, observation: Observation) -> bool:
         """Take chord steps, and return whether they converged; if not, keep the better of the two fields."""
@@ -512,9 +567,9 @@ class MapEstimator:
             )  # fmt: skip
             if not (top <= self._reach and size < math.inf):
                 return False
-            self.moved[:, self._free] += step[: self.std.size].reshape(wires, -1)
-            self.g += step[self.std.size :]
-            if size <= self._enough:
+            self.moved[:, self._free] += step[: self._no_noise.size].reshape(wires, -1)
+            self.g += step[self._no_noise.size :]
+            if self._is_enough(size):
                 return True
             if size > CHORD_RATE * before:
                 return False

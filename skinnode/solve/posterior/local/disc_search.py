@@ -24,6 +24,7 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.load_cells import MARGIN
 from skinnode.solve.posterior.local import discs as kernels
 from skinnode.solve.posterior.local.discs import LOADS, PARAMETERS, STEPS, Effects
+from skinnode.solve.posterior.local.load_effects import LoadEffects, Room
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
@@ -41,8 +42,16 @@ AMPLITUDES: Final = (-2.0, -1.0, 0.0, 1.0)
 SHAPES: Final = ((kernels.RADIUS, kernels.LAYER), (0.6, 4.0))
 """Radius R in cells and layer share β at which the search for a new disc starts: a contact on a half-space,
 and one on a thin bonded layer, which moves the skin only near the body."""
-REACH: Final = 4.5
-"""Radius around the start of a search within which the effects of loads are computed, in cells."""
+REACH: Final = 1.7
+"""Distance beyond a disc's radius up to which the effects of loads are computed, in cells. It leaves room for
+a step in the position or in the radius."""
+EDGE: Final = 0.8
+"""Distance beyond a disc's radius at which the load variance is a tenth of that in the middle, in cells. If
+the effects of loads at a smaller distance are missing, they are computed, and the search continues."""
+EXTENSIONS: Final = 3
+"""Maximum number of times that a search continues with more cells."""
+ROUNDS: Final = 2
+"""Maximum number of times that each of several discs is improved in a search."""
 MOST: Final = 4
 """Number of discs at which the search is abandoned. Loads that require this many discs are not local."""
 WIDE: Final = 3.0
@@ -51,6 +60,9 @@ deviations from discs would be too small."""
 PAYS: Final = 2.0
 """Minimum gain in log evidence for adding another disc, in excess of the logarithm of the number of
 parameters."""
+YIELDS: Final = 1.0
+"""Further gain that is expected when the other discs yield to a new one. If the gain misses the minimum by no
+more than this, it is computed with all discs."""
 NOTICED: Final = 8.0
 """Minimum squared match between a load and the remaining data at which another disc is tried, in noise
 variances."""
@@ -69,6 +81,7 @@ class DiscPrior:
 
     Attributes:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
+        response_t: (4Q, U f) displacement per unit load: the four loads of each cell, in pitches.
         spread: (U f,) variance of the displacement due to the uncertainty of the discs, in pitch².
     """
 
@@ -90,14 +103,16 @@ class DiscPrior:
             axis=1
         )
         gap = np.linalg.norm(self._place[:, None] - self._place, axis=-1)
-        self._near = np.asarray(
-            1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0)))
-        )
+        near = 1.0 / (1.0 + np.exp(np.minimum((gap - NEAR - kernels.SOFT) / kernels.SOFT, 40.0)))
+        self._near = np.asarray(near)
         self._scratch = kernels.make_scratch(len(self._place))
-        self.layer = layer
+        self._room = Room.of(len(self._place), estimator.equations)
         own = self._prior.response.reshape(len(layer), -1, 3)
-        self._response = np.concatenate([own, layer[..., None]], axis=2).reshape(len(layer), -1)
-        self._response_t = np.ascontiguousarray(self._response.T)
+        response = np.concatenate([own, layer[..., None]], axis=2).reshape(len(layer), -1)
+        self.response_t = np.ascontiguousarray(response.T)
+        self._probes = np.concatenate(
+            [near[self._inside] @ self.response_t[2::LOADS], self.response_t[3::LOADS][self._inside]]
+        )  # responses to the loads that are matched to the data
         self.discs: Float = np.empty((0, PARAMETERS))
         self.spread = np.zeros(len(self._prior.response))
 
@@ -113,35 +128,38 @@ class DiscPrior:
         untouched2: float,
         uniform2: float,
         *,
-        spread: bool,
+        everywhere: bool,
     ) -> Float | None:
         """Fit the discs to a frame, and return the load variances (2, Q), in pitch².
 
-        The estimator's factors are overwritten.
+        The estimator's factors are overwritten. The first discs of a touch, which are fitted again, have no
+        :attr:`spread`.
 
         Args:
             observation: The frame.
             members: Wires whose equations are used.
             untouched2: s² of the loads on untouched skin, in pitch².
             uniform2: s² of equal loads over the whole patch, in pitch².
-            spread: Whether to compute :attr:`spread` as well.
+            everywhere: Whether the discs are new. In this case, another disc is tried wherever a load matches
+                the remaining data best. Otherwise, discs beyond the current ones are tried only if the match
+                exceeds :data:`NOTICED`.
 
         Returns:
             The variances; None if the loads are not local.
         """
-        estimator = self._estimator
+        estimator, first = self._estimator, not len(self.discs)
         estimator.linearise(observation, members)
-        least = estimator.factorise_uniform(observation, uniform2) if not len(self.discs) else -math.inf
+        least = estimator.factorise_uniform(observation, uniform2) if first else -math.inf
         own = estimator.factorise_uniform(observation, untouched2)
         data = estimator.whitened_data()
-        search = _Search(self, data)
+        search = _Search(self, data, everywhere=everywhere)
         discs = search.start(self.discs)
         rejected: tuple[Float, float] | None = None
         while True:
-            places = search.places_of_next(discs)
+            places, beyond = search.places_of_next(discs)
             if not len(places):
                 break
-            more, gain = search.with_disc_at(places, discs)
+            more, gain = search.with_disc_at(places, discs, beyond=beyond)
             excess = gain - PAYS - math.log(PARAMETERS * len(more))
             if not excess > 0.0:
                 rejected = more, excess
@@ -153,9 +171,9 @@ class DiscPrior:
             return None
         self.discs = discs
         self.spread[:] = 0.0
-        if spread:
+        if not first:
             search.measure_spread(discs)
-        if spread and rejected is not None:
+        if rejected is not None and not first:
             search.add_spread_of_rejected(discs, *rejected)
         variance = np.empty((2, len(self._place)))
         kernels.add_variance(discs, self._place, variance)
@@ -165,120 +183,151 @@ class DiscPrior:
 class _Search:
     """Search for the discs of one frame, using the estimator's current whitened data."""
 
-    def __init__(self, prior: DiscPrior, data: Float) -> None:
-        self._p, self._data = prior, data
-        self._estimator = prior._estimator
-        self._cells: Index = np.arange(0)
-        self._rows = np.empty((len(data), 0))
-        self._effects = Effects(np.empty((0, 2)), np.empty((0, 0)), np.empty(0))
-        self._match = self._estimator.match(data, prior._response_t)
+    def __init__(self, prior: DiscPrior, data: Float, *, everywhere: bool) -> None:
+        self._p, self._data, self._everywhere = prior, data, everywhere
+        self._loads = LoadEffects(prior._estimator, prior._place, prior.response_t, data, prior._room)
         self._unit = np.zeros(2)
         self.evidence = 0.0
 
     def start(self, discs: Float) -> Float:
         """Return the discs of the last frame, refitted to this frame."""
-        if not len(discs):
-            return discs
-        self._include(discs[:, :2])
-        return self._climb(discs, 0)
-
-    def places_of_next(self, discs: Float) -> Float:
-        """Return the cells (P, 2) where another disc may be needed; none if no disc is needed.
-
-        In one of these cells, a load on a half-space matches the remaining data best; in the other, a load on
-        a bonded layer does.
-        """
-        if len(discs) == MOST:
-            return np.empty((0, 2))
-        left = self._match
         if len(discs):
-            q = np.empty(self._effects.match.size)
-            kernels.mean_loads(discs, self._effects, self._p._scratch, q)
-            left = self._estimator.match(self._data - self._rows @ q, self._p._response_t)
-        matches = np.abs([self._p._near @ left[2::LOADS], left[3::LOADS]])
-        best = np.argmax(np.where(self._p._inside, matches, 0.0), axis=1)
+            discs = self._fitted(discs)
+            if not self._everywhere:
+                self._set_unit(discs[0, :2])
+        return discs
+
+    def places_of_next(self, discs: Float) -> tuple[Float, bool]:
+        """Return cells (P, 2) where another disc may be needed, and whether they are beyond the discs.
+
+        There are none if no disc is needed. In one of two cells, a load on a half-space matches the remaining
+        data best; in the other, a load on a bonded layer does. If no match is noticed, but the discs are from
+        an earlier field, the cells are inside the discs, whose loads may have become unequal.
+        """
+        p = self._p
+        if len(discs) == MOST:
+            return np.empty((0, 2)), False
+        left = self._data
+        if len(discs):
+            left = left - self._loads.mean(discs, p._scratch)[0] @ self._loads.rows_t
+        matches, places = np.abs(p._estimator.match(left, p._probes)).reshape(2, -1), p._place[p._inside]
+        best, beyond = np.argmax(matches, axis=1), True
         if len(discs):
             noticed = matches[[0, 1], best] ** 2 >= NOTICED * self._unit
+            beyond = self._everywhere or bool(noticed.any())
             best = best[noticed]
-        return np.asarray(self._p._place[np.unique(best)])
+        if not beyond:
+            square = ((places[:, None] - discs[:, :2]) ** 2).sum(axis=-1)
+            within = (square <= np.exp(2.0 * discs[:, 2])).any(axis=1)
+            best = np.argmax(np.where(within, matches, 0.0), axis=1)
+        return places[np.unique(best)], beyond
 
-    def with_disc_at(self, places: Float, discs: Float) -> tuple[Float, float]:
-        """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence."""
+    def with_disc_at(self, places: Float, discs: Float, *, beyond: bool) -> tuple[Float, float]:
+        """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence.
+
+        The other discs change only if the new disc may pay. If ``places`` are not ``beyond`` the discs, no
+        further cells are used.
+        """
         p, before = self._p, self.evidence
-        self._include(places)
+        own = self._loads.near(places, np.full(len(places), kernels.RADIUS + REACH), include=beyond)
         if not len(discs):
-            near = p._near[np.argmin(((p._place - places[0]) ** 2).sum(axis=1))][self._cells]
-            gram = self._effects.gram
-            self._unit[:] = near @ gram[2::LOADS, 2::LOADS] @ near, gram.diagonal()[3::LOADS].max()
+            self._set_unit(places[0])
+        effects = self._loads.given(discs, own, p._scratch) if len(discs) else self._loads.effects
         trials = [
-            np.vstack([discs, [*place, math.log(radius), p._amplitude + more, math.log(layer)]])
+            np.array([[*place, math.log(radius), p._amplitude + more, math.log(layer)]])
             for place in places
             for radius, layer in SHAPES
             for more in AMPLITUDES
         ]
-        first = max(trials, key=lambda trial: kernels.evidence(trial, self._effects, p._scratch))
-        found = self._climb(first, len(discs))
-        gain = self.evidence - before
-        if len(discs) and gain > PAYS + math.log(PARAMETERS * len(found)):
-            found = self._climb(found, 0)
+        first = max(trials, key=lambda trial: kernels.evidence(trial, effects, p._scratch))
+        if not len(discs):
+            found = self._fitted(first)
             gain = self.evidence - before
+        else:
+            more, gain = self._climb(first, effects)
+            found = np.vstack([discs, more])
+            if gain > PAYS + math.log(PARAMETERS * len(found)) - YIELDS:
+                found = self._fitted(found)
+                gain = self.evidence - before
         if not gain > PAYS + math.log(PARAMETERS * len(found)):
             self.evidence = before
         return found, gain
 
-    def _climb(self, discs: Float, first: int) -> Float:
-        p, found = self._p, discs.copy()
-        self.evidence = kernels.climb(
-            found, first, self._effects, p._amplitude, p._bounds, found.copy(), p._scratch
-        )
-        return found
+    def _set_unit(self, place: Float) -> None:
+        """Compute the noise variance of the matches of loads like those at ``place``."""
+        p, rows_t = self._p, self._loads.rows_t
+        near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._loads.cells]
+        self._unit[0] = ((near @ rows_t[2::LOADS]) ** 2).sum()
+        self._unit[1] = (rows_t[3::LOADS] ** 2).sum(axis=1).max()
 
-    def _include(self, places: Float) -> None:
-        """Compute the effects of loads on the cells near ``places`` (P, 2)."""
-        p = self._p
-        gap = np.linalg.norm(p._place[:, None] - places, axis=-1).min(axis=1)
-        fresh = np.setdiff1d(np.flatnonzero(gap <= REACH), self._cells)
-        if not fresh.size:
-            return
-        self._cells = np.concatenate([self._cells, fresh])
-        columns = (LOADS * fresh[:, None] + np.arange(LOADS)).ravel()
-        rows = np.empty((len(self._data), columns.size))
-        self._estimator.whiten(np.ascontiguousarray(p._response[:, columns]), rows)
-        self._rows = np.hstack([self._rows, rows])
-        gram = np.empty((self._rows.shape[1], self._rows.shape[1]))
-        multiply(np.ascontiguousarray(self._rows.T), self._rows, gram)
-        every = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
-        self._effects = Effects(
-            np.ascontiguousarray(p._place[self._cells]), gram, np.ascontiguousarray(self._match[every])
-        )
+    def _fitted(self, discs: Float) -> Float:
+        """Return the discs with the largest evidence near ``discs``."""
+        loads = self._loads
+        loads.near(discs[:, :2], np.exp(discs[:, 2]) + REACH)
+        for _ in range(EXTENSIONS):
+            discs = self._improved(discs)
+            known = loads.cells.size
+            loads.near(discs[:, :2], np.exp(discs[:, 2]) + EDGE)
+            if loads.cells.size == known:
+                break
+        return discs
+
+    def _improved(self, discs: Float) -> Float:
+        """Return the discs after a search that uses only the cells whose effects have been computed.
+
+        Several discs are improved in turn, each given the others.
+        """
+        p, loads = self._p, self._loads
+        if len(discs) == 1:
+            discs, self.evidence = self._climb(discs, loads.effects)
+            return discs
+        discs = discs.copy()
+        for _ in range(ROUNDS):
+            before = discs.copy()
+            for d in range(len(discs)):
+                own = loads.near(discs[[d], :2], np.exp(discs[[d], 2]) + REACH)
+                others = np.delete(discs, d, axis=0)
+                discs[[d]], _ = self._climb(discs[[d]], loads.given(others, own, p._scratch))
+            if (discs == before).all():
+                break
+        self.evidence = kernels.evidence(discs, loads.effects, p._scratch)
+        self.evidence += kernels.log_prior(discs, p._amplitude)
+        return discs
+
+    def _climb(self, discs: Float, effects: Effects) -> tuple[Float, float]:
+        p, found = self._p, discs.copy()
+        work = np.empty((3, *found.shape))
+        evidence = kernels.climb(found, effects, p._amplitude, p._bounds, work, p._scratch)
+        return found, evidence
 
     def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
         """Add the variance due to a rejected disc that may nevertheless exist."""
-        p, effects = self._p, self._effects
-        own, other = np.empty((2, effects.match.size))
-        kernels.mean_loads(discs, effects, p._scratch, own)
-        kernels.mean_loads(more, effects, p._scratch, other)
-        columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
+        p, loads = self._p, self._loads
+        change = loads.mean(more, p._scratch)[0] - loads.mean(discs, p._scratch)[0]
         chance = 1.0 / (1.0 + math.exp(-excess))
-        p.spread += chance * (1.0 - chance) * (p._response[:, columns] @ (other - own)) ** 2
+        p.spread += chance * (1.0 - chance) * (change @ loads.response_t()) ** 2
 
     def measure_spread(self, discs: Float) -> None:
-        """Add the variance of the displacement due to the uncertainty of each disc parameter."""
-        p, effects = self._p, self._effects
-        own, other = np.empty((2, effects.match.size))
-        columns = (LOADS * self._cells[:, None] + np.arange(LOADS)).ravel()
-        response = p._response[:, columns]
-        best = kernels.mean_loads(discs, effects, p._scratch, own)
+        """Add the variance of the displacement due to the uncertainty of each disc parameter.
+
+        The displacement is averaged over three values of the parameter, weighted by their evidence.
+        """
+        p, loads = self._p, self._loads
+        own, best = loads.mean(discs, p._scratch)
         best += kernels.log_prior(discs, p._amplitude)
-        for d in range(len(discs)):
-            for parameter in range(PARAMETERS):
-                weights, shifts = [1.0], [np.zeros(len(response))]
-                for sign in (1.0, -1.0):
-                    trial = discs.copy()
-                    trial[d, parameter] += sign * STEPS[parameter]
-                    found = kernels.mean_loads(trial, effects, p._scratch, other)
-                    found += kernels.log_prior(trial, p._amplitude)
-                    weights.append(math.exp(min(found - best, 0.0)))
-                    shifts.append(response @ (other - own))
-                weight, shift = np.array(weights) / sum(weights), np.array(shifts)
-                p.spread += weight @ (shift - weight @ shift) ** 2
+        weight, change = np.ones((discs.size, 3)), np.empty((discs.size, 2, own.size))
+        for i in range(discs.size):
+            for side, sign in enumerate((1.0, -1.0)):
+                trial = discs.copy()
+                trial.ravel()[i] += sign * STEPS[i % PARAMETERS]
+                other, found = loads.mean(trial, p._scratch)
+                found += kernels.log_prior(trial, p._amplitude)
+                change[i, side] = other - own
+                weight[i, 1 + side] = math.exp(min(found - best, 0.0))
+        weight /= weight.sum(axis=1, keepdims=True)
+        moved = np.empty((2 * discs.size, len(p.spread)))
+        multiply(change.reshape(len(moved), -1), loads.response_t(), moved)
+        shift = np.zeros((discs.size, 3, len(p.spread)))
+        shift[:, 1:] = moved.reshape(discs.size, 2, -1)
+        shift -= np.einsum("pi,piu->pu", weight, shift)[:, None]
+        p.spread += np.einsum("pi,piu->u", weight, shift**2)

@@ -29,7 +29,12 @@ import numpy as np
 
 from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.cholesky import cholesky, solve_lower_transposed_vector, solve_lower_vector
+from skinnode.solve.linalg.cholesky import (
+    cholesky,
+    solve_lower,
+    solve_lower_transposed_vector,
+    solve_lower_vector,
+)
 from skinnode.solve.linalg.vectors import Index
 
 SOFT: Final = 0.25
@@ -70,6 +75,9 @@ class Effects(NamedTuple):
     """(4n, 4n) matrix M."""
     match: Float
     """(4n,) vector b."""
+    strongest: float = 0.0
+    """Largest load variance of the discs that ``gram`` and ``match`` already account for; 0 if there are
+    none."""
 
 
 class Scratch(NamedTuple):
@@ -112,7 +120,7 @@ def _factorise(discs: Float, effects: Effects, s: Scratch) -> int:
     """Factorise I + V M V and solve for Λ⁻¹ V b; return the number of loaded cells, or −1 on failure."""
     n = effects.place.shape[0]
     add_variance(discs, effects.place, s.root)
-    most = 0.0
+    most = effects.strongest
     for cell in range(n):
         most = max(most, s.root[0, cell])
     count = 0
@@ -201,42 +209,97 @@ def _allowed(value: float, parameter: int, bounds: Float) -> float:
 
 
 @njit
-def climb(  # noqa: PLR0913 - a kernel: arrays by name
-    discs: Float, first: int, effects: Effects, amplitude: float, bounds: Float, trial: Float, s: Scratch
-) -> float:
-    """Improve the discs (D, 5) in place by a coordinate search; return their evidence plus log prior.
+def whiten_by_discs(  # noqa: PLR0913 - a kernel: arrays by name
+    discs: Float, effects: Effects, own: Index, s: Scratch, cross: Float, gram: Float, match: Float
+) -> int:
+    """Prepare the effects of loads on the k cells ``own``, given the discs.
+
+    These effects are Mₒₒ − Cᵀ C and bₒ − Cᵀ Λ⁻¹ V b with C = Λ⁻¹ V Mₒ, where o stands for the loads of the k
+    cells.
 
     Args:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
-        first: Index of the first disc to improve; earlier discs do not change.
+        effects: Effects of the loads on the data.
+        own: (k,) positions of the cells in ``effects``.
+        s: Work arrays; ``vector`` receives Λ⁻¹ V b.
+        cross: (4n, 4k) receives C in its first rows.
+        gram: (4k, 4k) receives Mₒₒ.
+        match: (4k,) receives bₒ.
+
+    Returns:
+        The number of rows of C; −1 on failure.
+    """
+    count = _factorise(discs, effects, s)
+    for j in range(own.size):
+        to, start = LOADS * j, LOADS * own[j]
+        for u in range(LOADS):
+            match[to + u] = effects.match[start + u]
+            row, source = gram[to + u], effects.gram[start + u]
+            for i in range(own.size):
+                for t in range(LOADS):
+                    row[LOADS * i + t] = source[LOADS * own[i] + t]
+    if count < 0:
+        return -1
+    for i in range(count):
+        at = LOADS * s.cells[i]
+        for t in range(LOADS):
+            root = s.root[t // 3, s.cells[i]]
+            row, source = cross[LOADS * i + t], effects.gram[at + t]
+            for j in range(own.size):
+                to, start = LOADS * j, LOADS * own[j]
+                for u in range(LOADS):
+                    row[to + u] = root * source[start + u]
+    solve_lower(s.factor, cross, LOADS * count, LOADS * own.size)
+    return LOADS * count
+
+
+@njit
+def climb(  # noqa: PLR0913, C901 - a kernel: arrays by name
+    discs: Float, effects: Effects, amplitude: float, bounds: Float, work: Float, s: Scratch
+) -> float:
+    """Improve the discs (D, 5) in place by a coordinate search; return their evidence plus log prior.
+
+    After a sweep without an improvement, smaller steps are tried only in the direction in which the gain of
+    the larger step was greater.
+
+    Args:
+        discs: (D, 5) row, column, ln R, ln a and ln β of each disc.
         effects: Effects of the loads on the data.
         amplitude: Expected ln a.
         bounds: (2, 5) minimum and maximum of each parameter.
-        trial: (D, 5) copy of the discs, overwritten.
+        work: (3, D, 5) work array.
         s: Work arrays.
     """
+    trial, gain = work[0], work[1:]
+    for d in range(discs.shape[0]):
+        for p in range(PARAMETERS):
+            trial[d, p] = discs[d, p]
     best = evidence(trial, effects, s) + log_prior(trial, amplitude)
-    scale = 1.0
+    scale, still = 1.0, False
     for _ in range(SWEEPS):
         better = False
-        for d in range(first, discs.shape[0]):
+        for d in range(discs.shape[0]):
             for p in range(PARAMETERS):
-                taken = False
+                taken, one_way = False, still and not better
                 for sign in range(2):
-                    if sign == 1 and taken:
-                        break
+                    if taken or (one_way and gain[sign, d, p] < gain[1 - sign, d, p]):
+                        continue
                     step = scale * STEPS[p] * (1.0 - 2.0 * sign)
-                    for _ in range(4):
+                    gain[sign, d, p] = -math.inf
+                    for attempt in range(4):
                         trial[d, p] = _allowed(discs[d, p] + step, p, bounds)
                         if trial[d, p] == discs[d, p]:
                             break
                         found = evidence(trial, effects, s) + log_prior(trial, amplitude)
+                        if attempt == 0:
+                            gain[sign, d, p] = found - best
                         if not found > best + WORTH:
                             trial[d, p] = discs[d, p]
                             break
                         best = found
                         discs[d, p] = trial[d, p]
                         taken = better = True
-        if not better:
+        still = not better
+        if still:
             scale *= 0.5
     return best

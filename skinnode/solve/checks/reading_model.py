@@ -47,8 +47,6 @@ class Level:
 
     precision: Float
     """(m, m) precision P of the readings."""
-    diagonal: Float
-    """(m,) diagonal of the precision P."""
     wires: WireTables
     """Cholesky factors of each wire's blocks of P and S."""
 
@@ -176,7 +174,6 @@ class ReadingModel:
         multiply(vectors, weighted, precision)
         return Level(
             precision=precision,
-            diagonal=self.diagonals[number],
             wires=WireTables.of(precision, covariance, self.shape),
         )
 

@@ -154,3 +154,32 @@ class TestDeadline:
         for number, (_, frame) in enumerate(stream[:12], 1):
             assert tracker.update(frame).trusted
             assert clock.calls == number
+
+    def test_an_interrupted_frame_keeps_the_contacts_and_claims_nothing_about_them(
+        self, staggered, stream, monkeypatch
+    ):
+        """Contacts of a few wires take longer than the wires themselves, and the time is up."""
+        tracker = sk.Tracker(staggered, relative_noise=1e-5, deadline_us=50.0, method="exact")
+        clock = Clock(monkeypatch, 0.0)
+        for _, frame in stream[:12]:
+            before = tracker.update(frame)
+        clock.call_s = 20e-6
+        cut = [tracker.update(frame) for _, frame in stream[12:14]]
+        clock.call_s = 0.0
+        after = tracker.update(stream[14][1])
+        (kept,) = before.contacts
+        for field in cut:
+            assert sk.Status.DEADLINE in field.status
+            assert not field.trusted
+            assert not field.precise
+            (contact,) = field.contacts
+            assert contact.normal_force_n == kept.normal_force_n
+            np.testing.assert_array_equal(contact.centroid_m, kept.centroid_m)
+            np.testing.assert_array_equal(field.force_n, before.force_n)
+            stds = contact.centroid_std_m, contact.shear_force_std_n
+            assert np.isinf(np.concatenate(stds)).all()
+            assert np.isinf([contact.normal_force_std_n, contact.area_std_m2]).all()
+        (contact,) = after.contacts
+        assert after.trusted
+        assert contact.normal_force_n != kept.normal_force_n
+        assert np.isfinite(contact.normal_force_std_n)

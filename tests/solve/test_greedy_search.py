@@ -160,6 +160,25 @@ def gain_of_wires(covariance, z, cost):
     return gains
 
 
+@pytest.mark.parametrize("seed", range(24))
+def test_a_search_is_abandoned_only_if_it_cannot_gain_enough(search, seed):
+    """The bounds must hold for presses, wrong wires and missing readings, at costs high and low."""
+    model, greedy = search
+    random = np.random.default_rng(100 + seed)
+    z, present = (seed % 3 > 0) * pressed(model, seed), np.ones(model.shape, bool)
+    wire = int(random.integers(0, model.shape[seed % 2]))
+    wrong = np.s_[:, wire] if seed % 2 else np.s_[wire]
+    z[wrong] += random.choice([2.0, 20.0, 200.0]) * random.standard_normal(z[wrong].shape)
+    present.ravel()[random.choice(z.size, seed % 4, replace=False)] = False
+    z[~present] = 0.0
+    for faults, cost in ((False, COST), (True, COST), (True, 1.5)):
+        full = run(greedy, z, present, cost, faults=faults)
+        found = steps(greedy)
+        assert run(greedy, z, present, cost, faults=faults, needed=full - 1e-6) == full
+        assert steps(greedy) == found
+        assert run(greedy, z, present, cost, faults=faults, needed=full + 1e4) == -math.inf
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_no_wire_is_overlooked(search, seed):
     """A bound spares most wires the test; it must not spare one that would gain."""

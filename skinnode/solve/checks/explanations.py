@@ -40,6 +40,8 @@ the margin reached 77 and 87 nats in two presses (``bench trust --seed 1 --only 
 DOUBT: Final = 5.0
 """Minimum margin at which a frame is considered doubtful, in nats. In 144 healthy frames, the margin over
 explanations by up to 8 loads was never positive."""
+CLEAR: Final = -30.0
+"""Margin, in nats, below which loads or noise clearly explain a frame. Lower margins need not be computed."""
 SCALES: Final = 4
 """Number of prior scales searched for explanations: the best-fitting scale and smaller ones. A wrong reading
 can inflate the best-fitting scale by a factor of up to 2⁴, a narrow contact by up to 2³."""
@@ -86,7 +88,7 @@ class Explainer:
         self._row = np.empty(max(model.shape) + 1)
         self.margin = -math.inf
         """Margin of the last frame, in nats: log evidence with faults minus log evidence with loads or more
-        noise."""
+        noise. Below :data:`CLEAR`, it is only a bound, or −inf."""
         self.is_noisier = False
         """Whether noise above the stated level explains the last frame better than loads do."""
 
@@ -115,38 +117,46 @@ class Explainer:
             whole_wires_only: Whether to search only for wires that contradict the others. Single wrong
                 readings and crossed wires are then skipped.
         """
-        by_loads, by_faults = -math.inf, -math.inf
-        groups: tuple[Group, ...] = ()
-        with_faults = not whole_wires_only
         products = self._search.products(z, _scales(best))
-        for number, of_scale in zip(_scales(best), products, strict=True):
-            start = float(evidence[number])
-            loads = start + self._search.run(number, z, of_scale, present, cost, faults=False)
-            by_loads = max(by_loads, loads)
-            if with_faults:
-                total = start + self._search.run(number, z, of_scale, present, cost, faults=True)
-                if total > by_faults:
-                    by_faults, groups = total, self._groups()
-                with_faults = total > loads - HOPELESS
+        scales = list(zip(_scales(best), products, strict=True))
+        of_loads = [
+            float(evidence[number]) + self._search.run(number, z, of_scale, present, cost, faults=False)
+            for number, of_scale in scales
+        ]
+        by_loads = max(of_loads)
         self.is_noisier = noisier > by_loads + DOUBT
         by_loads = max(by_loads, noisier)
+        by_faults = -math.inf
+        groups: tuple[Group, ...] = ()
+        for (number, of_scale), loads in zip(scales, of_loads, strict=True) if not whole_wires_only else ():
+            start, hopeless = float(evidence[number]), loads - HOPELESS
+            needed = min(by_loads + CLEAR, hopeless)
+            total = start + self._search.run(
+                number, z, of_scale, present, cost, faults=True, needed=needed - start
+            )
+            if total > by_faults:
+                by_faults, groups = total, self._groups()
+            if total <= hopeless:
+                break
         level, alpha = self._model.level(best), products[0, : z.size].copy()
         if not whole_wires_only:
-            by_pair, pair = self._by_exchange(z, present, cost, alpha, level)
+            by_pair, pair = self._by_exchange(z, present, cost, alpha, level, by_loads + CLEAR)
             if by_pair > by_faults:
                 by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
-            by_reading, number = self._by_reading(z, products, present, evidence, best, cost)
+            needed = by_loads + MARGIN_OF_READING
+            by_reading, number = self._by_reading(z, products, present, evidence, best, cost, needed)
             # A narrow load at the edge of a patch looks like a wrong reading. A smaller margin is therefore
             # no reason to doubt the frame.
-            if by_reading > max(by_faults, by_loads + MARGIN_OF_READING):
+            if by_reading > max(by_faults, needed):
                 by_faults, groups = by_reading, (self._reading(number, by_reading - by_loads),)
         self.margin, needed = by_faults - by_loads, MARGIN
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
         if finding.gain > DOUBT:
-            by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma)
+            enough = by_loads + MARGIN_OF_WIRE
+            by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma, enough)
             # A load on only one wire makes this wire contradict the others. A smaller margin is therefore no
             # reason to doubt the frame.
-            if by_wire > max(by_faults, by_loads + MARGIN_OF_WIRE):
+            if by_wire > max(by_faults, enough):
                 self.margin, needed = by_wire - by_loads, MARGIN_OF_WIRE
                 groups = (self._wire(finding.wire, self.margin),)
         return groups if self.margin > needed else ()
@@ -169,10 +179,18 @@ class Explainer:
         return groups
 
     def _by_reading(  # noqa: PLR0913 - the frame, and what is known of it
-        self, z: Float, products: Float, present: Mask, evidence: Float, best: int, cost: float
+        self,
+        z: Float,
+        products: Float,
+        present: Mask,
+        evidence: Float,
+        best: int,
+        cost: float,
+        needed: float,
     ) -> tuple[float, int]:
         """Return the highest log evidence for loads and one wrong reading, and the index of this reading.
 
+        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
         A single reading needs its own search. At small prior scales, the greedy search would first leave out
         the whole wire of this reading.
         """
@@ -186,29 +204,44 @@ class Explainer:
         for scale, of_scale, alpha in zip(_scales(best), products, alphas[:, number].tolist(), strict=True):
             d = max(float(self._model.diagonals[scale, number]), LEAST)
             gain = 0.5 * alpha * alpha / d - 0.5 * math.log(d) - cost - math.log(z.size)
-            gain += self._search.run(scale, z, of_scale, without, cost, faults=False)
-            most = max(most, float(evidence[scale]) + gain)
+            gain += float(evidence[scale])
+            gain += self._search.run(scale, z, of_scale, without, cost, faults=False, needed=needed - gain)
+            most = max(most, gain)
         return most, number
 
     def _reading(self, number: int, gain: float) -> Group:
         upper, lower = divmod(number, self._model.shape[1])
         return Group(FaultyPart.CROSSING, upper, lower, gain)
 
-    def _by_exchange(
-        self, z: Float, present: Mask, cost: float, alpha: Float, level: Level
+    def _by_exchange(  # noqa: PLR0913 - the frame, and what is known of it
+        self, z: Float, present: Mask, cost: float, alpha: Float, level: Level, needed: float
     ) -> tuple[float, WirePair]:
-        """Return the highest log evidence for loads and two exchanged wires, and these wires."""
-        gain, pair = likeliest(level.precision, alpha, z, present, far=True)
-        if gain < DOUBT:
+        """Return the highest log evidence for loads and two exchanged wires, and these wires.
+
+        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
+        """
+        gain, pair = likeliest(level.precision, alpha, z, present, far=True, enough=DOUBT)
+        if gain <= DOUBT:
             return -math.inf, pair
         straight, there = exchanged(z, present, pair)
         choice = math.log(sum(math.comb(count, 2) for count in self._model.shape))
-        return self._by_loads(straight, there, cost, lambda level: -choice), pair
+        return self._by_loads(straight, there, cost, lambda level: -choice, needed), pair
 
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
-        self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
+        self,
+        z: Float,
+        present: Mask,
+        cost: float,
+        finding: WireFinding,
+        alpha: Float,
+        best: int,
+        tau: float,
+        needed: float,
     ) -> float:
-        """Return the highest log evidence for loads and a fault of the wire in ``finding``."""
+        """Return the highest log evidence for loads and a fault of the wire in ``finding``.
+
+        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
+        """
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
         rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
@@ -221,6 +254,7 @@ class Explainer:
                 present,
                 cost,
                 lambda level: -choice - prior - 0.5 * math.log1p(tau**2 * level.wires.sums[wire]),
+                needed,
             )
         own = z[rows].ravel().copy()
         tables = self._model.level(best).wires
@@ -235,18 +269,29 @@ class Explainer:
             square = float((np.linalg.solve(of_s, own) ** 2).sum())
             return -choice - float(tables.log_det_p[wire] + tables.log_det_s[wire]) - 0.5 * square
 
-        return self._by_loads(z, present, cost, alone)
+        return self._by_loads(z, present, cost, alone, needed)
 
-    def _by_loads(self, z: Float, present: Mask, cost: float, extra: Callable[[Level], float]) -> float:
-        """Return the highest log evidence for loads alone, with ``extra`` added at each κ."""
+    def _by_loads(
+        self, z: Float, present: Mask, cost: float, extra: Callable[[Level], float], needed: float
+    ) -> float:
+        """Return the highest log evidence for loads alone, with ``extra`` added at each κ.
+
+        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
+        """
         model = self._model
         evidence, scratch = np.empty(len(model.kappa)), np.empty((2, z.size))
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
+        starts = {number: float(evidence[number]) + extra(model.level(number)) for number in _scales(best)}
+        half_chi2 = -evidence - 0.5 * model.log_det  # no loads can gain more
+        hopeful = [number for number in starts if starts[number] + half_chi2[number] >= needed]
+        if not hopeful:
+            return -math.inf
         return max(
-            float(evidence[number])
-            + extra(model.level(number))
-            + self._search.run(number, z, of_scale, present, cost, faults=False)
-            for number, of_scale in zip(_scales(best), self._search.products(z, _scales(best)), strict=True)
+            starts[number]
+            + self._search.run(
+                number, z, of_scale, present, cost, faults=False, needed=needed - starts[number]
+            )
+            for number, of_scale in zip(hopeful, self._search.products(z, hopeful), strict=True)
         )
 
     def _wire(self, wire: int, gain: float) -> Group:

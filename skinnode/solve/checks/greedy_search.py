@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.compiled.jit import njit
+from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.checks.wire_tests import LEAST
@@ -33,7 +33,7 @@ loads each. With a maximum of 8, half of the healthy frames of a deep slide were
 ENOUGH: Final = 1.0
 """Minimum gain in log evidence (nats) for adding a load or a group of wrong readings."""
 ROUNDING: Final = 1e-6
-"""Margin for rounding errors in the bound of a wire's gain, in nats."""
+"""Margin for rounding errors in the bounds of gains, in nats."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
 """Kinds of search steps: add a load; leave out one reading; leave out all readings of a lower wire, or of an
 upper wire."""
@@ -85,8 +85,11 @@ class GreedySearch:
         *,
         faults: bool,
         loads: bool = True,
+        needed: float = -math.inf,
     ) -> float:
         """Find the best explanation of a frame, store its steps as attributes and return its gain in nats.
+
+        The search is abandoned, and −inf returned, once the gain cannot exceed ``needed``.
 
         Args:
             number: Index of κ.
@@ -96,21 +99,38 @@ class GreedySearch:
             cost: Log evidence subtracted for each wrong reading, in nats.
             faults: Whether the explanation may contain wrong readings.
             loads: Whether the explanation may contain loads.
+            needed: Gain that is of interest, in nats.
         """
         self.kinds[:] = -1
+        if 0.5 * float(z.ravel() @ products[: z.size]) + self._slack(number, cost, faults) < needed:
+            return -math.inf
         (m, count), (upper, lower) = self._model.response.shape, self._model.shape
         level, tables = self._model.level(number), self._model.loads(number)
         weighted, diagonal = products.copy(), tables.diagonal.copy()
         vectors, share = np.empty((LOADS + m, m + count)), np.empty(LOADS + m)
-        of_upper, of_lower = np.empty((upper, lower, lower)), np.empty((lower, upper, upper))
+        of_upper, of_lower = level.wires.of_upper, level.wires.of_lower
+        if faults:  # the search changes them
+            of_upper, of_lower = of_upper.copy(), of_lower.copy()
         block, right = np.empty((max(upper, lower),) * 2), np.empty(max(upper, lower))
+        items, applied = np.empty(m, np.int64), np.zeros(upper + lower, np.int64)
         return _search(
-            z.ravel(), present.ravel().copy(), upper, lower, cost, loads, faults,
+            z.ravel(), present.ravel().copy(), upper, lower, cost, loads, faults, needed,
+            self._slack(number, cost, faults),
             LEAST * float(tables.diagonal[m:].max()),
             level.precision, tables.moved_t, tables.gram, self._model.response_t, level.wires.log_det_p,
-            weighted, diagonal, vectors, share, of_upper, of_lower, block, right,
+            level.wires.log_det_s,
+            weighted, diagonal, vectors, share, of_upper, of_lower, block, right, items, applied,
             self.kinds, self.numbers, self.gains,
         )  # fmt: skip
+
+    def _slack(self, number: int, cost: float, faults: bool) -> float:
+        """Return an upper bound of ½ ln det S_GG − cost · |G| over all sets G of readings; 0 without faults.
+
+        All principal minors of S e^(−2 cost) are at most det(I + S e^(−2 cost)).
+        """
+        if not faults:
+            return 0.0
+        return 0.5 * float(np.log1p(math.exp(-2.0 * cost) / self._model.shrink[number]).sum())
 
 
 @njit
@@ -158,8 +178,29 @@ def _group_gain(  # noqa: PLR0913 - a kernel: arrays by name
     return gain
 
 
+@njit_part
+def _update_block(  # noqa: PLR0913 - a kernel: arrays by name
+    block: Float, first: int, step: int, vectors: Float, share: Float, done: int, count: int
+) -> None:
+    """Apply the updates ``done`` to ``count`` to the block of the readings ``first``, ``first + step``, ….
+
+    The updates are those of P, with the search vectors and their shares.
+    """
+    size = len(block)
+    for k in range(done, count):
+        row = vectors[k]
+        for i in range(size):
+            factor = share[k] * row[first + i * step]
+            for j in range(size):
+                block[i, j] -= factor * row[first + j * step]
+
+
 @njit
 def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
+    count: int,
+    vectors: Float,
+    share: Float,
+    applied: Index,
     d: Float,
     alpha: Float,
     present: Mask,
@@ -169,28 +210,46 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
     enough: float,
     bound: float,
     log_det_p: Float,
+    log_det_s: Float,
     block: Float,
     right: Float,
 ) -> tuple[float, int, int]:
     """Return the largest gain from treating a group of readings as wrong, and the group's kind and index.
 
     A group is a single reading or all readings of a wire. The gain of each group is reduced by ln n, where n
-    is the number of groups of its kind. Groups whose gain cannot exceed ``enough`` may be ignored: the gain
-    of a wire is at most ``bound`` minus its element of ``log_det_p`` (U + K,) and minus the costs. ``block``
-    and ``right`` are work arrays.
+    is the number of groups of its kind. Groups whose gain cannot exceed ``enough`` may be ignored. The gain
+    of a wire is at most ``bound`` plus its element of ``log_det_s`` (U + K,) minus the costs. While all
+    readings are in use, it is also at most ``bound`` minus its element of ``log_det_p`` minus the costs.
+    A wire's block of P is updated only when it is needed: ``applied`` (U + K,) is the number of updates, of
+    ``count`` in ``vectors`` and ``share``, that it contains. ``block`` and ``right`` are work arrays.
     """
     upper, lower = len(of_upper), len(of_lower)
+    complete = True
+    for i in range(present.size):
+        complete &= present[i]
     gain, number = crossing_gain(d, alpha, present, cost)
     kind = CROSSING
     for k in range(lower):
-        if bound - log_det_p[upper + k] - cost * upper - math.log(lower) <= max(gain, enough):
+        here = 0
+        for i in range(upper):
+            here += present[i * lower + k]
+        most = -log_det_p[upper + k] if complete else log_det_s[upper + k]
+        if bound + most - cost * here - math.log(lower) <= max(gain, enough):
             continue
+        _update_block(of_lower[k], k, lower, vectors, share, applied[upper + k], count)
+        applied[upper + k] = count
         value = _group_gain(of_lower[k], alpha, present, k, lower, cost, block, right) - math.log(lower)
         if value > gain:
             gain, kind, number = value, LOWER, k
     for u in range(upper):
-        if bound - log_det_p[u] - cost * lower - math.log(upper) <= max(gain, enough):
+        here = 0
+        for k in range(lower):
+            here += present[u * lower + k]
+        most = -log_det_p[u] if complete else log_det_s[u]
+        if bound + most - cost * here - math.log(upper) <= max(gain, enough):
             continue
+        _update_block(of_upper[u], u * lower, 1, vectors, share, applied[u], count)
+        applied[u] = count
         value = _group_gain(of_upper[u], alpha, present, u * lower, 1, cost, block, right) - math.log(upper)
         if value > gain:
             gain, kind, number = value, UPPER, u
@@ -198,32 +257,47 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 
 
 @njit
-def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
-    item: int, first: int, p: Float, moved_t: Float, gram: Float, response_t: Float, row: Float
+def _reading_rows(  # noqa: PLR0913 - a kernel: arrays by name
+    items: Index, p: Float, moved_t: Float, gram: Float, response_t: Float, rows: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 4Q,), from ``moved_t`` and ``gram`` if available.
+    """Write the rows of E that belong to the readings ``items`` (n,) into ``rows`` (≥ n, m + 4Q).
+
+    All rows are written in one pass through ``moved_t``, whose columns are far apart in memory.
+    """
+    m = len(p)
+    for k in range(items.size):
+        row, of_reading = rows[k], p[items[k]]
+        for j in range(m):
+            row[j] = of_reading[j]
+        if not gram.size:
+            multiply_vector(response_t, row[:m], row[m:])
+    if gram.size:
+        for j in range(len(moved_t)):
+            of_load = moved_t[j]
+            for k in range(items.size):
+                rows[k, m + j] = of_load[items[k]]
+
+
+@njit
+def _load_row(  # noqa: PLR0913 - a kernel: arrays by name
+    load: int, first: int, p: Float, moved_t: Float, gram: Float, response_t: Float, row: Float
+) -> None:
+    """Write the row of E that belongs to a load into ``row`` (m + 4Q,).
 
     If ``first`` is m, only the elements of the loads are valid.
     """
     m = len(p)
-    if item < m:
-        for j in range(m):
-            row[j] = p[item, j]
-    elif not gram.size:
-        multiply_vector(p, response_t[item - m], row[:m])
-    elif first < m:
-        by_reading = moved_t[item - m]
+    if not gram.size:
+        multiply_vector(p, response_t[load], row[:m])
+        multiply_vector(response_t, row[:m], row[m:])
+        return
+    if first < m:
+        by_reading = moved_t[load]
         for i in range(m):
             row[i] = by_reading[i]
-    if not gram.size:
-        multiply_vector(response_t, row[:m], row[m:])
-    elif item < m:
-        for j in range(len(moved_t)):
-            row[m + j] = moved_t[j, item]
-    else:
-        by_load = gram[item - m]
-        for j in range(by_load.size):
-            row[m + j] = by_load[j]
+    by_load = gram[load]
+    for j in range(by_load.size):
+        row[m + j] = by_load[j]
 
 
 @njit
@@ -231,10 +305,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
     item: int,
     count: int,
     first: int,
-    p: Float,
-    moved_t: Float,
-    gram: Float,
-    response_t: Float,
+    m: int,
     weighted: Float,
     diagonal: Float,
     vectors: Float,
@@ -242,12 +313,11 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Update the search vectors for step ``count``, which adds a load or leaves out a reading.
 
-    ``item`` is the index of the load or reading among the columns of A. A load is assigned its most likely
-    variance (b² − h) / h², where b is its element of Aᵀ P z and h its diagonal element of E. Elements before
-    ``first`` are not updated.
+    ``item`` is the index of the load or reading among the columns of A; ``vectors[count]`` is its row of E,
+    and becomes Aᵀ v. A load is assigned its most likely variance (b² − h) / h², where b is its element of
+    Aᵀ P z and h its diagonal element of E. Elements before ``first`` are not updated.
     """
     row = vectors[count]
-    _gram_row(item, first, p, moved_t, gram, response_t, row)
     size = row.size
     for i in range(count):
         earlier = vectors[i]
@@ -255,7 +325,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
         for j in range(first, size):
             row[j] -= factor * earlier[j]
     b = weighted[item]
-    if item < len(p):
+    if item < m:
         share[count] = 1.0 / (row[item] + LEAST)
     else:
         h = max(diagonal[item], LEAST)
@@ -264,40 +334,8 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
     for j in range(first, size):
         weighted[j] -= of_b * row[j]
         diagonal[j] -= of_square * row[j] * row[j]
-    if item < len(p):
+    if item < m:
         weighted[item] = 0.0
-
-
-@njit
-def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
-    """Copy each upper and lower wire's block of P into ``of_upper`` and ``of_lower``."""
-    upper, lower = len(of_upper), len(of_lower)
-    for u in range(upper):
-        for i in range(lower):
-            for j in range(lower):
-                of_upper[u, i, j] = p[u * lower + i, u * lower + j]
-    for k in range(lower):
-        for i in range(upper):
-            for j in range(upper):
-                of_lower[k, i, j] = p[i * lower + k, j * lower + k]
-
-
-@njit
-def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -> None:
-    """Subtract share · v vᵀ from each upper and lower wire's block."""
-    upper, lower = len(of_upper), len(of_lower)
-    for u in range(upper):
-        block, first = of_upper[u], u * lower
-        for i in range(lower):
-            factor = share * row[first + i]
-            for j in range(lower):
-                block[i, j] -= factor * row[first + j]
-    for k in range(lower):
-        block = of_lower[k]
-        for i in range(upper):
-            factor = share * row[i * lower + k]
-            for j in range(upper):
-                block[i, j] -= factor * row[j * lower + k]
 
 
 @njit
@@ -313,6 +351,37 @@ def _best_load(weighted: Float, diagonal: Float, m: int, least: float) -> tuple[
 
 
 @njit
+def _fall(  # noqa: PLR0913 - a kernel: arrays by name
+    kind: int,
+    number: int,
+    weighted: Float,
+    diagonal: Float,
+    present: Mask,
+    of_upper: Float,
+    of_lower: Float,
+    block: Float,
+    right: Float,
+) -> float:
+    """Return how much a step reduces ½ zᵀ P z. ``block`` and ``right`` are work arrays."""
+    m, lower = present.size, len(of_lower)
+    if kind in (LOAD, CROSSING):
+        item = m + number if kind == LOAD else number
+        precision = max(float(diagonal[item]), LEAST)
+        fall = 0.5 * float(weighted[item]) ** 2 / precision
+        return max(fall - 0.5, 0.0) if kind == LOAD else fall
+    if kind == LOWER:
+        _group_gain(of_lower[number], weighted, present, number, lower, 0.0, block, right)
+        size = len(of_upper)
+    else:
+        _group_gain(of_upper[number], weighted, present, number * lower, 1, 0.0, block, right)
+        size = lower
+    fall = 0.0
+    for i in range(size):
+        fall += 0.5 * float(right[i]) ** 2
+    return fall
+
+
+@njit
 def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     z: Float,
     present: Mask,
@@ -321,12 +390,15 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     cost: float,
     with_loads: bool,
     faults: bool,
+    needed: float,
+    slack: float,
     least: float,
     p: Float,
     moved_t: Float,
     gram: Float,
     response_t: Float,
     log_det_p: Float,
+    log_det_s: Float,
     weighted: Float,
     diagonal: Float,
     vectors: Float,
@@ -335,37 +407,42 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     of_lower: Float,
     block: Float,
     right: Float,
+    items: Index,
+    applied: Index,
     kinds: Index,
     numbers: Index,
     gains: Float,
 ) -> float:
     """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain in nats.
 
-    While all readings are in use, the gain of a wire is bounded. χ² = zᵀ P z is at least α_Gᵀ P_GG⁻¹ α_G, and
-    a load with a gain of ½ (r − 1 − ln r) multiplies the determinant of any block P_GG by at least 1/r.
+    Bounds of the gains: the gain of a load, ½ (r − 1 − ln r), reduces ½ χ² = ½ zᵀ P z by ½ (r − 1) and
+    multiplies the determinants of all blocks of S by at most r. The gain of a group G of wrong readings
+    reduces ½ χ² by ½ α_Gᵀ P_GG⁻¹ α_G; the rest of it is −½ ln det P_GG ≤ ½ ln det S_GG minus the costs. The
+    gain of all further steps is therefore at most the remaining ½ χ² (``left``), and with faults at most
+    ``left`` + ``paid`` + ``slack``, where ``paid`` is the sum of ½ ln r.
     """
     m = z.size
-    count, bound = 0, 0.0
-    for i in range(m):
-        bound += 0.5 * z[i] * weighted[i]
+    count, left, paid, chosen = 0, 0.0, 0.0, 0
     for i in range(m):
         if not present[i]:
-            bound = math.inf
-            _update(i, count, 0, p, moved_t, gram, response_t, weighted, diagonal, vectors, share)
-            count += 1
-    if faults:
-        _copy_blocks(p, of_upper, of_lower)
-        for i in range(count):
-            _update_blocks(share[i], vectors[i], of_upper, of_lower)
+            items[chosen] = i
+            chosen += 1
+    _reading_rows(items[:chosen], p, moved_t, gram, response_t, vectors)
+    for k in range(chosen):
+        _update(items[k], count, 0, m, weighted, diagonal, vectors, share)
+        count += 1
+    for i in range(m):
+        left += 0.5 * z[i] * weighted[i]
     total = 0.0
     for step in range(STEPS if faults else LOADS):
         gain, kind, number = 0.0, LOAD, -1
         if with_loads:
             gain, number = _best_load(weighted, diagonal, m, least)
         if faults:
+            enough = gain if number >= 0 else -math.inf
             by_fault, fault, which = _best_group(
-                diagonal, weighted, present, of_upper, of_lower, cost, gain if number >= 0 else -math.inf,
-                bound + ROUNDING, log_det_p, block, right,
+                count, vectors, share, applied, diagonal, weighted, present, of_upper, of_lower, cost, enough,
+                left + paid + ROUNDING, log_det_p, log_det_s, block, right,
             )  # fmt: skip
             if by_fault > gain or number < 0:
                 gain, kind, number = by_fault, fault, which
@@ -373,28 +450,31 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
             break
         total += gain
         kinds[step], numbers[step], gains[step] = kind, number, gain
+        left -= _fall(kind, number, weighted, diagonal, present, of_upper, of_lower, block, right)
+        if kind == LOAD and faults:
+            paid += 0.5 * math.log(max(weighted[m + number] ** 2 / diagonal[m + number], 1.0))
+        if total + left + paid + slack + ROUNDING < needed:
+            return -math.inf
         if kind == LOAD:
             # the first m elements, for the readings, are needed only to find faults
-            first, b = 0 if faults else m, weighted[m + number]
-            _update(
-                m + number, count, first, p, moved_t, gram, response_t, weighted, diagonal, vectors, share
-            )
-            if faults:
-                _update_blocks(share[count], vectors[count], of_upper, of_lower)
-                h = vectors[count, m + number]
-                bound -= 0.5 * (share[count] * b * b + math.log(max(1.0 - share[count] * h, LEAST)))
+            first = 0 if faults else m
+            _load_row(number, first, p, moved_t, gram, response_t, vectors[count])
+            _update(m + number, count, first, m, weighted, diagonal, vectors, share)
             count += 1
             continue
-        bound = math.inf
+        chosen = 0
         for i in range(m):
-            chosen = (
+            belongs = (
                 (kind == CROSSING and i == number)
                 or (kind == LOWER and i % lower == number)
                 or (kind == UPPER and i // lower == number)
             )
-            if chosen and present[i]:
+            if belongs and present[i]:
                 present[i] = False
-                _update(i, count, 0, p, moved_t, gram, response_t, weighted, diagonal, vectors, share)
-                _update_blocks(share[count], vectors[count], of_upper, of_lower)
-                count += 1
+                items[chosen] = i
+                chosen += 1
+        _reading_rows(items[:chosen], p, moved_t, gram, response_t, vectors[count:])
+        for k in range(chosen):
+            _update(items[k], count, 0, m, weighted, diagonal, vectors, share)
+            count += 1
     return total

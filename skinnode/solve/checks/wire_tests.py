@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class WireTables:
-    """Cholesky factors of each wire's blocks of P and S, at one κ.
+    """Each wire's blocks of P, and the Cholesky factors of its blocks of P and S, at one κ.
 
     The arrays have the shape (U, K, K) for upper wires and (K, U, U) for lower wires.
     """
@@ -47,6 +47,10 @@ class WireTables:
     """Cholesky factors of S_GG for the upper wires."""
     lower_p: Float
     lower_s: Float
+    of_upper: Float
+    """Blocks P_GG of the upper wires."""
+    of_lower: Float
+    """Blocks P_GG of the lower wires."""
     log_det_p: Float
     """(U + K,) ½ ln det P_GG of each wire."""
     log_det_s: Float
@@ -60,13 +64,16 @@ class WireTables:
 
         Reads only the wires' blocks of both matrices (:func:`wire_blocks`).
         """
-        of_p = [_factors(each + LEAST * np.eye(each.shape[-1])) for each in wire_blocks(p, shape)]
+        blocks = [np.array(each, order="C") for each in wire_blocks(p, shape)]
+        of_p = [_factors(each + LEAST * np.eye(each.shape[-1])) for each in blocks]
         of_s = [_factors(each) for each in wire_blocks(s, shape)]
         return cls(
             upper_p=of_p[0],
             upper_s=of_s[0],
             lower_p=of_p[1],
             lower_s=of_s[1],
+            of_upper=blocks[0],
+            of_lower=blocks[1],
             log_det_p=np.concatenate([_half_log_det(each) for each in of_p]),
             log_det_s=np.concatenate([_half_log_det(each) for each in of_s]),
             sums=np.concatenate([(each.sum(axis=1) ** 2).sum(axis=1) for each in of_p]),

@@ -15,6 +15,7 @@ import numpy as np
 from skinnode.compiled.jit import njit
 from skinnode.model.frames import Contact, FieldFrame, amended
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.status import Status
 from skinnode.process.clock import perf_counter
 from skinnode.solve.exact.load_fit import LoadFit
 from skinnode.solve.linalg.vectors import Index
@@ -77,14 +78,20 @@ class ExactContacts:
         """Return the field with its contacts and, unless the ``stiffness_n_per_m`` option is set, its forces.
 
         Wires with an infinite standard deviation are ignored. If every wire is ignored, there are no contacts
-        and all forces are zero.
+        and all forces are zero. If the deadline interrupted the solver, there is no time to compute contacts:
+        the field then has the contacts and forces of the previous field, and the standard deviations of these
+        contacts are infinite.
 
         Args:
             field: Field of the exact method, after its roots and readings have been checked.
         """
         start = perf_counter()
         held = field.held is not None and bool(field.held.all())
-        if not (held and self._known):
+        if Status.DEADLINE in field.status:
+            if self._known:
+                self._contacts = tuple(_outdated(contact) for contact in self._contacts)
+                self._known = False
+        elif not (held and self._known):
             self._force, self._contacts = self._find(field.displacement_m, field.displacement_std_m)
             self._known = True
         if not self._contacts and (self._stiff or self._force is field.force_n):
@@ -113,6 +120,17 @@ class ExactContacts:
         else:
             loads = self._fit.fit(self._moved, level)
         return self._finder.find(loads, displacement_m, std_m)
+
+
+def _outdated(contact: Contact) -> Contact:
+    """Return a contact with infinite standard deviations."""
+    return dataclasses.replace(
+        contact,
+        centroid_std_m=np.full(3, np.inf),
+        area_std_m2=math.inf,
+        normal_force_std_n=math.inf,
+        shear_force_std_n=np.full(2, np.inf),
+    )
 
 
 @njit

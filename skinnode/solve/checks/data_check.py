@@ -41,8 +41,8 @@ suspicious frames: it searches for the most likely explanation of their readings
 EXCUSED: Final = 10.0
 """Excess gain (nats) over an examined frame below which a frame is considered similar to it."""
 EXCUSED_FRAMES: Final = 8
-"""Number of frames for which the result of an examination also applies to similar frames. An examination takes
-about as long as solving and testing two other frames."""
+"""Number of frames for which the result of an examination also applies to similar frames. An examination
+takes about as long as solving and testing two other frames."""
 SUSPICIOUS_CHANGE: Final = 20.0
 """Gain in log evidence from assuming that one reading is wrong, in nats, above which the change since the
 last field is suspicious. Of 660 frames of moving loads at noise 1e-5, 1.4 % exceeded this limit, under an

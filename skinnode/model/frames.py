@@ -163,8 +163,8 @@ class FieldFrame:
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches the skin, if no wire could be solved, or if
     ``contacts`` was switched off. Detection uses hysteresis from scan to scan, so that noise does not split
-    or remove a contact. If a field of the exact method is incomplete because of its deadline, its contacts
-    and forces are those of the previous field, and the contacts have infinite standard deviations.
+    or remove a contact. If a field of the exact method is incomplete because of its deadline, it has the
+    contacts and forces of the previous field, for at most three successive fields.
     """
     gain: Float | None = None
     """(U,) estimated relative gain error of each wire's resistances; None if gains are not estimated."""

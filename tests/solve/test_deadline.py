@@ -155,16 +155,14 @@ class TestDeadline:
             assert tracker.update(frame).trusted
             assert clock.calls == number
 
-    def test_an_interrupted_frame_keeps_the_contacts_and_claims_nothing_about_them(
-        self, staggered, stream, monkeypatch
-    ):
+    def test_an_interrupted_frame_keeps_the_contacts(self, staggered, stream, monkeypatch):
         """Contacts of a few wires take longer than the wires themselves, and the time is up."""
         tracker = sk.Tracker(staggered, relative_noise=1e-5, deadline_us=50.0, method="exact")
         clock = Clock(monkeypatch, 0.0)
-        for _, frame in stream[:12]:
+        for _, frame in stream[:9]:
             before = tracker.update(frame)
         clock.call_s = 20e-6
-        cut = [tracker.update(frame) for _, frame in stream[12:14]]
+        cut = [tracker.update(frame) for _, frame in stream[9:14]]
         clock.call_s = 0.0
         after = tracker.update(stream[14][1])
         (kept,) = before.contacts
@@ -172,14 +170,12 @@ class TestDeadline:
             assert sk.Status.DEADLINE in field.status
             assert not field.trusted
             assert not field.precise
-            (contact,) = field.contacts
-            assert contact.normal_force_n == kept.normal_force_n
-            np.testing.assert_array_equal(contact.centroid_m, kept.centroid_m)
+        for field in cut[:3]:
+            assert field.contacts == before.contacts
             np.testing.assert_array_equal(field.force_n, before.force_n)
-            stds = contact.centroid_std_m, contact.shear_force_std_n
-            assert np.isinf(np.concatenate(stds)).all()
-            assert np.isinf([contact.normal_force_std_n, contact.area_std_m2]).all()
+        # with a deadline that is always too short, contacts must not be those of long ago
+        assert cut[3].contacts != before.contacts
+        assert cut[4].contacts == cut[3].contacts
         (contact,) = after.contacts
         assert after.trusted
         assert contact.normal_force_n != kept.normal_force_n
-        assert np.isfinite(contact.normal_force_std_n)

@@ -27,6 +27,9 @@ UNTOUCHED: Final = 4.0
 
 Noise alone exceeds this limit in 2 % of frames, which are then searched for contacts.
 """
+PATIENCE: Final = 4
+"""Number of successive interrupted fields after which contacts are computed although the deadline has passed.
+Computing them from a few wires takes up to 7 ms."""
 WILD: Final = 16.0
 """Ratio of a wire's variance to the median over all wires above which the wire is left out. All variances are
 relative to their values at rest."""
@@ -73,24 +76,24 @@ class ExactContacts:
         self._finder.reset()
         self._fit.reset()
         self._force, self._contacts, self._known = self.no_force_n, self._no_contacts, False
+        self._interrupted = 0  # number of successive fields that the deadline interrupted
 
     def add(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its contacts and, unless the ``stiffness_n_per_m`` option is set, its forces.
 
         Wires with an infinite standard deviation are ignored. If every wire is ignored, there are no contacts
-        and all forces are zero. If the deadline interrupted the solver, there is no time to compute contacts:
-        the field then has the contacts and forces of the previous field, and the standard deviations of these
-        contacts are infinite.
+        and all forces are zero. If the deadline interrupted the solver, there is no time to compute contacts,
+        and the field has the contacts and forces of the previous field. In every :data:`PATIENCE`-th such
+        field in succession, they are computed from the solved wires regardless.
 
         Args:
             field: Field of the exact method, after its roots and readings have been checked.
         """
         start = perf_counter()
         held = field.held is not None and bool(field.held.all())
-        if Status.DEADLINE in field.status:
-            if self._known:
-                self._contacts = tuple(_outdated(contact) for contact in self._contacts)
-                self._known = False
+        self._interrupted = self._interrupted + 1 if Status.DEADLINE in field.status else 0
+        if self._interrupted % PATIENCE:
+            self._known = False
         elif not (held and self._known):
             self._force, self._contacts = self._find(field.displacement_m, field.displacement_std_m)
             self._known = True
@@ -120,17 +123,6 @@ class ExactContacts:
         else:
             loads = self._fit.fit(self._moved, level)
         return self._finder.find(loads, displacement_m, std_m)
-
-
-def _outdated(contact: Contact) -> Contact:
-    """Return a contact with infinite standard deviations."""
-    return dataclasses.replace(
-        contact,
-        centroid_std_m=np.full(3, np.inf),
-        area_std_m2=math.inf,
-        normal_force_std_n=math.inf,
-        shear_force_std_n=np.full(2, np.inf),
-    )
 
 
 @njit

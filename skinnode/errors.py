@@ -12,8 +12,8 @@
      │     └ SdoAbort              with the code and text from CiA 301
      └ CodecError(ValueError)      a payload does not match its COB-ID
 
-Lost chunks, stale patches and solves that do not converge occur in normal operation. They are reported
-through statuses and counters, not by exceptions. An array of the wrong shape raises a plain ``ValueError``.
+Lost chunks, stale patches and solves that do not converge occur in normal operation. They are reported by
+statuses and counters, not by exceptions. An array of the wrong shape raises a plain ``ValueError``.
 """
 
 from __future__ import annotations

@@ -28,13 +28,13 @@ _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
 """Minimum interval between batches of rogue frames, in ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""Time by which flood frames are queued in advance, in ns. This prevents gaps on a fully starved bus."""
+"""How far in advance flood frames are queued, in ns. This prevents gaps on a fully starved bus."""
 _MOST_AT_ONCE: Final = 256
 """Maximum number of overdue rogue frames of one kind in a batch. The rest are dropped."""
 _RETRY_S: Final = 0.05
 """Time from a bus error until the rogue device reopens its endpoint, in s."""
 _LONGEST_WAIT_S: Final = 3600.0
-"""Longest wait for the next rogue frame, in s. A wait of centuries is an error."""
+"""Longest wait for the next rogue frame, in s. A wait of centuries would raise an error."""
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240

@@ -42,7 +42,7 @@ class FaultPlayer:
         self._thread = clock.thread(self._run, "faults of the scene")
 
     def start(self) -> None:
-        """Start the thread. It waits for :meth:`begin`, unless the schedule has begun before.
+        """Start the thread. It waits for :meth:`begin`, unless the schedule has already begun.
 
         The thread runs on the clock of the calling thread, even if the player was created on another clock.
         """

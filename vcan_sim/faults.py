@@ -53,18 +53,18 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults whose value is a wire number; faults of upper and lower wires alternate."""
+"""Faults whose value is a wire number, with faults of upper and lower wires alternating."""
 RATE_PER_S: Final = (1e-6, 1e5)
-"""Minimum and maximum rate of a fault, 1/s, unless it is 0. A bus of 1 Mbit/s carries fewer frames than the
-maximum."""
+"""Minimum and maximum rate of a fault, in 1/s, unless the rate is 0. A 1 Mbit/s bus carries fewer frames per
+second than this maximum."""
 _RANGES: Final = {"emcy_per_s": RATE_PER_S, "babble_per_s": RATE_PER_S, "restart_every_s": (1e-3, 1e6)}
-"""Minimum and maximum of each fault that repeats, unless it is 0."""
+"""Minimum and maximum value of each repeating fault, unless the value is 0."""
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
 """Maximum absolute value of each fault that can be negative."""
 
 
 def check_range(name: str, value: float, least: float, greatest: float) -> None:
-    """Raise ConfigError unless a rate or an interval is 0, or lies in a range.
+    """Raise ConfigError unless a rate or interval is either 0 or within a range.
 
     Args:
         name: Name of the fault.
@@ -109,17 +109,17 @@ class Faults:
 
     # --- fractions of the scans
     torn: float = 0.0
-    """Fraction of scans that are cut off: the second half of the chunks and the summary are not sent. The
+    """Fraction of scans that are cut off: the summary and the second half of the chunks are not sent. The
     next scan has the same scan counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """Fraction of scans in which the node is reset after half of the chunks, as if by a watchdog."""
+    """Fraction of scans in which the node is reset after sending half of the chunks, as if by a watchdog."""
     displaced: float = 0.0
     """Fraction of scans in which one chunk carries the scan counter of the next scan. The next scan then
     lacks the chunk with the same index."""
     understated: float = 0.0
     """Fraction of scans in which one chunk is lost and the summary hides the loss. The summary counts one
-    chunk fewer, sets the flag for changed chunks only, and has a valid check if the node sends checks. If the
+    chunk fewer, sets the changed-chunks-only flag, and has a valid check if the node sends checks. If the
     node itself sent only changed chunks, the summary is not altered."""
     unchecked: float = 0.0
     """Fraction of scans whose summary contains no check, as in protocol revision 1.0."""
@@ -158,8 +158,8 @@ class Faults:
     frozen: bool = False
     """Whether the converter is frozen: its readings and its conversion count stop changing."""
     uncounted: bool = False
-    """Whether the converter lacks a conversion count. A host can then detect a stopped converter only
-    from constant codes."""
+    """Whether the converter lacks a conversion count. A host can then detect a stopped converter only by its
+    constant codes."""
     unplugged: bool = False
     """Whether the node is disconnected from the bus and the power supply. It boots when the fault ends."""
     wrong_identity: bool = False
@@ -193,8 +193,8 @@ class Faults:
     crossed_lower: int | None = None
     """Number of a lower wire whose connection is swapped with the next lower wire's."""
     flipped: float = 0.0
-    """Fraction of readings with one flipped bit in one code. The check includes the flipped bit, so the scan
-    passes the check."""
+    """Fraction of readings with one flipped bit in one code. The check is computed after the bit is flipped,
+    so the scan passes it."""
     drift_per_s: float = 0.0
     """Relative drift of all resistances per second, from -1 to 1. The accumulated factor stays between 0.1
     and 10, and the drift disappears when the fault ends."""

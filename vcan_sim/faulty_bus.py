@@ -125,7 +125,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """From now on, abort a fraction ``share`` of all transmissions with error frames."""
+        """Abort a fraction ``share`` of all further transmissions with error frames."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

@@ -135,7 +135,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """With probability ``flipped``, flip one bit of one code in a reading."""
+        """Flip one bit of one code in a reading with probability ``flipped``."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

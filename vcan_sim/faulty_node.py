@@ -155,7 +155,7 @@ class FaultyNode(PatchNode):
     # --- input to the node: frames and time
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """Pass a frame to the node, unless a fault drops it, and to the second node if there is one."""
+        """Pass a frame to the node unless a fault drops it, and to the second node, if any."""
         self._hear(can_id, data, t_ns, remote)
         if self._twin is not None:
             self._twin.on_frame(can_id, data, t_ns, remote)
@@ -228,7 +228,7 @@ class FaultyNode(PatchNode):
         return min(due) if own is None else min(own, *due)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Pass the CAN controller state to the node; pass error-passive while that fault is active."""
+        """Pass the CAN controller state to the node, or error-passive while that fault is active."""
         self._controller = state
         passive = self._passive and state is not BusState.OFF
         super().on_bus(BusState.PASSIVE if passive else state, t_ns)
@@ -259,7 +259,7 @@ class FaultyNode(PatchNode):
             self._faulty_scans.power_off()
             self.injected.unplugged += 1
         else:
-            self._due_ns = dict.fromkeys(self._due_ns, 0)  # nothing was due without power
+            self._due_ns = dict.fromkeys(self._due_ns, 0)  # nothing was due while the power was off
             self.power_on(t_ns)
 
     def _reset_if_due(self, t_ns: int) -> None:

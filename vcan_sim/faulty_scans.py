@@ -28,7 +28,7 @@ class Put(Protocol):
 class FaultyScans:
     """Injects faults into the chunks and summaries that a node sends.
 
-    A scan has either one scan fault, or chunk faults in any number of its chunks. A chunk has at most one
+    A scan has either one scan fault or chunk faults in any number of its chunks. A chunk has at most one
     fault.
 
     Args:
@@ -198,7 +198,7 @@ class FaultyScans:
             self._spoilt = True
             self._injector.injected.scans_spoilt += 1
 
-    # Each of these methods injects one chunk fault, and returns whether it was injected.
+    # Each of these methods tries to inject one chunk fault and returns whether it succeeded.
 
     def _lose(self, data: bytes) -> bool:
         self._injector.tally.lost[Kind.CHUNK] += 1
@@ -258,7 +258,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send delayed chunks. If the bus rejects any, raises BusError after the last one."""
+        """Send delayed chunks. Raises BusError after the last frame if the bus rejects any of them."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

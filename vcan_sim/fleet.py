@@ -29,7 +29,7 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Duration (s) of the initial part of a scene whose contact mechanics are computed before the nodes start.
+"""Duration (s) of the first part of a scene, for which contact mechanics are computed before the nodes start.
 The rest is computed on demand."""
 
 
@@ -155,7 +155,8 @@ class Fleet:
     def start(self) -> None:
         """Compute the initial part of the scene, open the buses and power on the nodes.
 
-        A stopped fleet can be started again. Its scene, which has not paused, continues at the current time.
+        A stopped fleet can be started again. Its scene was not paused in the meantime, so it continues at the
+        current time.
 
         Raises:
             BusError: If a bus cannot be opened. Buses already opened are closed again.
@@ -322,9 +323,10 @@ class Fleet:
     def truth_at(self, patch: str, t_ns: int) -> PatchTruth:
         """Return the ground truth at a given time: displacement, contacts, pressure and wrench.
 
-        The displacement is that of the simulated patch, like :meth:`displacement_m`: it includes creep and
-        hysteresis, and each upper wire has the time at which a scan that starts at ``t_ns`` samples it. The
-        contacts and the wrench are those of the scene at ``t_ns``, on an elastic skin without imperfections.
+        The displacement is that of the simulated patch, as in :meth:`displacement_m`: it includes creep and
+        hysteresis, and each upper wire is evaluated at the time at which a scan that starts at ``t_ns``
+        samples it. The contacts and the wrench are those of the scene at ``t_ns``, on an elastic skin without
+        imperfections.
 
         Args:
             patch: Name of the patch.

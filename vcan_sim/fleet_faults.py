@@ -1,4 +1,4 @@
-"""Current faults of the patches and buses of a simulated hand, and a log of their changes.
+"""Current faults of a simulated hand's patches and buses, and a log of their changes.
 
 Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, the ``vcan-sim inject`` command and the fault
 schedule of a scene. Changes made together are all checked first: if one is invalid, none takes effect.
@@ -156,7 +156,8 @@ class FleetFaults:
     def follow(self, ended: Iterable[TimedFault], started: Iterable[TimedFault]) -> None:
         """Apply scheduled changes. A start that contradicts other faults is refused and logged.
 
-        A fault that ends as another starts at the same place changes into it, unless the start is refused.
+        If one fault ends just as another starts at the same place, the first changes into the second, unless
+        the start is refused.
 
         Args:
             ended: Scheduled faults to end.

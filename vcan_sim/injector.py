@@ -29,7 +29,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Draw at random which fault occurs, if any, and return its name; "" if none occurs."""
+        """Select at random the fault that occurs, if any, and return its name; "" if none occurs."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""

@@ -343,7 +343,7 @@ def skin_faults(_skin_test: SkinTest) -> SkinFaults:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """If a test of a simulated hand or its set-up fails, save the hand's data and list the files."""
+    """Save a simulated hand's data and list the files if the test or its set-up fails."""
     report = yield
     test = item.stash.get(_TEST, None)
     if test is not None and report.when in ("setup", "call") and report.failed:

@@ -57,7 +57,7 @@ class Recording:
     """Recording of a fleet during a ``with`` block, which must enclose the fleet's ``with`` block.
 
     Call :meth:`poll` at least once a minute, because patches store a limited number of readings. If an
-    exception ends the block before the first frame and the first reading, the folder is removed again.
+    exception ends the block before any frame or reading has been recorded, the folder is removed.
 
     Args:
         folder: New folder for the files.
@@ -66,7 +66,7 @@ class Recording:
 
     Raises:
         ConfigError: On entry, if the folder already exists or cannot be created.
-        BusError: On entry, if a bus cannot be opened. The folder is removed again.
+        BusError: On entry, if a bus cannot be opened. The folder is then removed.
         OSError: From any method, if a file cannot be written.
     """
 
@@ -108,7 +108,7 @@ class Recording:
             self._open = opened.pop_all()
 
     def _is_empty(self) -> bool:
-        """Return whether neither a frame nor a reading has been recorded, because the fleet did not start."""
+        """Return whether the recording is empty (no frames, no readings) because the fleet did not start."""
         readings = any(patch.read_times_ns() for patch in self._fleet.patches.values())
         return not readings and (self._folder / TRACE).stat().st_size == 0
 

@@ -28,7 +28,7 @@ FROM_NODES: Final = frozenset(
 )
 """Kinds of frames that nodes send. Hosts send the other kinds, and possibly heartbeats."""
 _DRAINED_EVERY: Final = 64
-"""Number of frames sent between successive clearings of the receive queues."""
+"""Number of frames sent before the receive queues are cleared again."""
 
 
 @dataclass(frozen=True, slots=True)

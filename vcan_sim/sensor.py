@@ -17,7 +17,7 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
 
 REMEMBERED_READINGS: Final = 4096
-"""Number of recent readings whose times are stored: five minutes at 12.5 scans per second."""
+"""Number of recent readings whose times are stored, enough for five minutes at 12.5 scans per second."""
 
 Fault = Callable[[Float, int], Float]
 """Function that takes a reading (U, K) in ohms and its time in ns, and returns the faulty reading. An open
@@ -116,7 +116,7 @@ class SimulatedPatch:
     def note_repeat(self, t_ns: int) -> None:
         """Store the time of a reading in which a frozen converter repeats the last one.
 
-        The scan is sent with the time of this reading, for which there is a ground truth, too.
+        The scan is sent with the time of this reading, for which there is also a ground truth.
         """
         self.last_read_ns = t_ns
         self._remember(t_ns)

@@ -111,7 +111,7 @@ class Segment:
             self.bus.disconnect(now_ns, station)
         self.listeners: list[Callable[[Event], None]] = []
         self._inboxes: dict[int, Inbox] = {}
-        # The station that left first is used first, so that no frame on the bus began before it left.
+        # The station that left first is reused first, so that no frame now on the bus began before it left.
         self._unused = deque(range(MOST_STATIONS))
         self._leaving: set[int] = set()
         self._connected: set[int] = set()

@@ -34,7 +34,7 @@ START_NS: Final = 1_000_000_000_000
 START_WALL_NS: Final = 1_600_000_000_000_000_000
 """Start of a virtual clock in Unix time (ns): 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
-"""Number of clock readings without a wait after which a thread is considered to be polling."""
+"""Number of consecutive clock readings, without a wait, after which a thread is considered to be polling."""
 POLL_S: Final = 1e-4
 """Time for which each clock reading suspends a polling thread, in s."""
 
@@ -62,7 +62,8 @@ class VirtualClock:
         self._now_ns = START_NS
         self._readings = 0  # number of clock readings by the running thread since its last wait
         self._ready: deque[_Turn] = deque()
-        # Waits of the first thread that a signal handler's exception has ended: the turn and its ``waits``.
+        # Waits of the first thread that were ended by an exception from a signal handler: the turn and its
+        # ``waits``.
         self._interrupted: deque[tuple[_Turn, int]] = deque()
         self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
         self._number = itertools.count()
@@ -95,8 +96,8 @@ class VirtualClock:
 
         Only one thread runs at a time, and handing over to a thread on another CPU takes several times as
         long, because that CPU is usually idle and must wake up first. With SCHED_BATCH, a woken thread does
-        not preempt the thread that has woken it and still holds the interpreter lock. A turn then takes less
-        than half the CPU time.
+        not preempt the thread that woke it and still holds the interpreter lock. A turn then takes less than
+        half as much CPU time.
         """
         if hasattr(os, "sched_setaffinity"):  # Linux
             self._cpus = os.sched_getaffinity(0)
@@ -146,8 +147,8 @@ class VirtualClock:
 
         Args:
             t_ns: Monotonic time of the call, in ns. A time in the past means as soon as possible.
-            function: Function to call. It must not wait. If it raises an exception, the thread that entered
-                the ``with`` block raises it when it waits.
+            function: Function to call. It must not wait. If it raises an exception, the exception is raised
+                in the thread that entered the ``with`` block when that thread waits.
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
 
@@ -201,7 +202,7 @@ class VirtualClock:
             if due_ns is not None:
                 heapq.heappush(self._timers, (due_ns, next(self._number), waits, turn))
             self._pass_on(turn, waits)
-            if self._now_ns > begun_ns:  # also if no other thread had a turn meanwhile
+            if self._now_ns > begun_ns:  # even if no other thread had a turn in the meantime
                 self._readings = 0
             return turn.woken
         except BaseException:
@@ -219,8 +220,8 @@ class VirtualClock:
     def _make_ready(self, turn: _Turn) -> None:
         """End the wait of a thread.
 
-        If a signal handler raises an exception between two steps, the thread is ready, and the next call or
-        :meth:`_take_turn` does the rest.
+        If a signal handler raises an exception between two steps, the thread is ready nevertheless, and the
+        next call or :meth:`_take_turn` completes the remaining steps.
         """
         if turn not in self._ready:
             self._ready.append(turn)
@@ -275,7 +276,7 @@ class VirtualClock:
             self._ready.remove(turn)
 
     def _block(self, turn: _Turn, following: _Turn | None, waits: int) -> None:
-        """Give ``following`` the turn, if it is not None, and block the current thread until its own turn.
+        """Give the turn to ``following`` unless it is None, and block the current thread until its own turn.
 
         Python runs signal handlers in the main thread, even while another thread has the turn, and between
         any two steps of the hand-over. If a handler raises an exception before the hand-over, the exception
@@ -330,7 +331,8 @@ class VirtualClock:
                 try:
                     what()
                 except BaseException as error:
-                    # Raised here, it would end whichever thread happens to be waiting, and stop the others.
+                    # If raised here, the exception would end whichever thread happens to be waiting, and stop
+                    # the others.
                     self._raise_in_first(error)
         return self._ready[0]
 

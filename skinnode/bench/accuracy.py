@@ -22,8 +22,8 @@ ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
 """Maximum error of the posterior for each layout, as a fraction of the RMS displacement, for a 10 % press at
 h = 0.5 with a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Number of scenes per row of the coverage table, divided by the number per cell of the noise and code
-tables. A cell needs at least three scenes; each contributes 300 coordinates to its RMS error."""
+"""Ratio of scenes per row of the coverage table to scenes per cell of the noise and code tables. A cell needs
+at least three scenes; each contributes 300 coordinates to its RMS error."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _report(
 
 
 def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
-    """Run only the families of loads that the prior does not expect, and return the results.
+    """Run only the load families that the prior does not expect, and return the results.
 
     Args:
         scenes: Number of scenes per family, layout and noise level.
@@ -71,7 +71,7 @@ def run_families(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
 
 
 def run_past(scenes: int, prior: str, echo: Callable[[str], object]) -> dict[str, Any]:
-    """Run only the streams with and without earlier frames, and return the results.
+    """Run only the comparison of streams solved with and without earlier frames; return the results.
 
     Args:
         scenes: Number of scenes per family.
@@ -92,7 +92,7 @@ def run_pareto(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
 
 
 def run_skew(scenes: int, echo: Callable[[str], object]) -> dict[str, Any]:
-    """Run only the scenes whose upper wires are sampled one after the other, and return the results.
+    """Run only the scenes with sequentially sampled upper wires, and return the results.
 
     Args:
         scenes: Number of scenes for each scan period, row time, speed, noise and method.

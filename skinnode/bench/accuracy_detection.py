@@ -2,10 +2,10 @@
 
 The readings come from :class:`skinnode.bench.truth.Skin`, an independent forward model with closed-form
 displacements. A *blunt sphere* has a contact radius of 1.5 to 3 pitches, like a finger pad. A *small sphere*
-has a sphere radius of 1.5 to 3.5 pitches. Pressed to a depth of 2 % into a layer half a pitch thick, it has a
-contact radius of 0.1 to 0.2 pitches and changes the readings less than the noise does. The ``signal`` column
-shows the norm of the change in the readings, in units of the noise. A detector that knows the load, its
-position and its size in advance needs a signal of 3.6 to find 95 % of the presses within three frames
+has a sphere radius of 1.5 to 3.5 pitches. When pressed into a layer half a pitch thick to a depth of 2 %, it
+has a contact radius of 0.1 to 0.2 pitches and changes the readings less than the noise does. The ``signal``
+column shows the norm of the change in the readings, in units of the noise. A detector that knows the load,
+its position and its size in advance needs a signal of 3.6 to find 95 % of the presses within three frames
 (``REACHABLE``).
 
 False alarms are counted frame by frame at the detector's output while the gains of all wires drift.
@@ -46,7 +46,7 @@ FAMILIES: Final = (
 )
 """Load families as (kind, depth in layer heights)."""
 REQUIRED: Final = (("blunt sphere", 0.02), ("dent", 0.05))
-"""Loads for which a fraction :data:`FOUND` of the presses must be found within three frames."""
+"""Loads for which at least a fraction :data:`FOUND` of presses must be found within three frames."""
 FOUND: Final = 0.95
 WITHIN: Final = 3
 REACHABLE: Final = 3.6
@@ -310,7 +310,7 @@ def times(seed: int) -> dict[str, Any]:
         start_ns = time.thread_time_ns()
         patch.detector.see(frame)
         one_by_one.append(1e-3 * (time.thread_time_ns() - start_ns))
-    # other programs slow down some rounds; the fastest round shows the time of the detector itself
+    # other programs slow down some rounds; the fastest round gives the detector's own time
     return {
         "stream_us": dict(zip(STREAM, np.percentile(one_by_one, STREAM).tolist(), strict=True)),
         "median_us": min(median for median, _ in rounds),

@@ -62,7 +62,7 @@ class Scene:
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the norm of a displacement's (U, N, 3) error, relative to the true displacement's norm."""
+        """Return the norm of the (U, N, 3) displacement error, relative to that of the true displacement."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
@@ -79,7 +79,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Time up to seven calls; return the shortest time (µs), which other programs affected least."""
+    """Time up to seven calls; return the shortest time (µs), the one least affected by other programs."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -130,7 +130,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Measure all scenes; return one row per run with its time, its error and its Pareto optimality."""
+    """Measure all scenes; return one row per run: time, error and whether it is Pareto-optimal."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)

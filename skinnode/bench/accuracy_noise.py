@@ -224,7 +224,7 @@ class Follower:
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """Solve a stream with each method; return the field of the last frame, keyed by method."""
+        """Solve a stream with each method; return the last frame's fields, keyed by method."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }
@@ -296,7 +296,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return a press in each half of the patch (30 % of the scenes), or one sharp or blunt press."""
+    """Return one press in each half of the patch (30 % of scenes), or a single sharp or blunt press."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -318,8 +318,8 @@ def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes with both methods.
 
     Returns:
-        One row per layout, noise level and method, with force errors for the ``posterior`` method; and the
-        rows of :class:`Parts` for the errors of the posterior in all scenes.
+        One row per layout, noise level and method, with force errors for the ``posterior`` method; also the
+        rows of :class:`Parts` for the posterior's errors in all scenes.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

@@ -1,10 +1,9 @@
-"""Compares the methods of solving a frame by their error and their CPU time: a Pareto front for each noise.
+"""Compares methods of solving a frame by error and CPU time, with a Pareto front for each noise level.
 
-In each stream, a body is pressed, held still, slides and is slowly released. The truth comes from the
-families of ``skinnode bench accuracy --only families``; half of the rigid bodies press on a bonded layer of
-the simulator. Each method solves the same readings. The frames in which a body is held and those in which it
-moves are counted separately, because a held field costs little, and a held body gains most from earlier
-frames.
+In each stream, a body is pressed in, held still, slid and slowly released. The truth comes from the families
+of ``skinnode bench accuracy --only families``; half of the rigid bodies press on a bonded layer of the
+simulator. Each method solves the same readings. Frames in which the body is held are counted separately from
+those in which it moves, because a held field costs little and a held body gains most from earlier frames.
 """
 
 from __future__ import annotations
@@ -101,9 +100,9 @@ def _solver(skin: Skin, sigma: float, method: str) -> Tracker | Posterior:
 
 
 def mark_front(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows with the additional value ``front``: whether no other method is better.
+    """Return the rows with the additional value ``front``, which is true if no other method is better.
 
-    A method is better if both its error and its CPU time are smaller in the same noise, motion and family.
+    A method is better if both its error and its CPU time are smaller for the same noise, motion and family.
     """
 
     def is_better(other: dict[str, Any], row: dict[str, Any]) -> bool:
@@ -119,7 +118,7 @@ def sigmas(figures: dict[str, Any]) -> list[float]:
 
 
 def pooled(figures: dict[str, Any], sigma: float, motion: str) -> list[dict[str, Any]]:
-    """Return the rows of all families together for one noise level and motion, one for each method."""
+    """Return the rows for all families combined at one noise level and motion, one row per method."""
     return [
         row
         for row in figures["pareto"]
@@ -128,7 +127,7 @@ def pooled(figures: dict[str, Any], sigma: float, motion: str) -> list[dict[str,
 
 
 def outdone(figures: dict[str, Any]) -> dict[str, list[float]]:
-    """Return the noise levels at which a method is on no Pareto front, for each such method."""
+    """Return, for each method that is on no Pareto front at some noise level, those noise levels."""
     found: dict[str, list[float]] = {}
     for sigma in sigmas(figures):
         rows = [row for motion in MOTIONS for row in pooled(figures, sigma, motion)]
@@ -163,7 +162,7 @@ _COLUMNS: Final = (
 
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
-    """Print the table for all families together, and the methods that are on no Pareto front."""
+    """Print the table for all families combined, and list the methods that are on no Pareto front."""
     layout = f"{LAYOUT[0]} h={LAYOUT[1]:g}"
     echo(f"\nCPU time per frame and median error of each method, {layout}, all families; *: Pareto front")
     echo(f"  {'noise, motion, method':32}{''.join(title.rjust(width) for _, title, width, _ in _COLUMNS)}")

@@ -44,7 +44,7 @@ class Phase:
     share: float
     """Depth at the end of the phase, divided by the full depth."""
     shift: float = 0.0
-    """Distance from the first position at the end of the phase, in pitches."""
+    """Distance from the initial position by the end of the phase, in pitches."""
     slowing: bool = False
     """Whether the motion slows down exponentially, as in creep; otherwise, its speed is constant."""
 
@@ -69,7 +69,7 @@ STEPS: Final = 2
 """Number of parts into which a motion is divided. The displacement is computed at the end of each part and
 interpolated linearly in between."""
 CREEP: Final = 3.0
-"""Number of time constants in a phase that slows down."""
+"""Duration of a phase that slows down, in time constants."""
 
 
 @dataclass
@@ -77,11 +77,11 @@ class Sum:
     """Sums over the frames of a phase."""
 
     errors: list[float] = dataclasses.field(default_factory=list)
-    """Relative errors of the touched frames."""
+    """Relative errors of the frames with a touch."""
     inside: Float = dataclasses.field(default_factory=lambda: np.zeros(2))
-    """Numbers of moved coordinates and of coordinates at rest within the 95 % interval."""
+    """Numbers of moved and resting coordinates within the 95 % interval."""
     count: Float = dataclasses.field(default_factory=lambda: np.zeros(2))
-    """Numbers of moved coordinates and of coordinates at rest with a finite standard deviation."""
+    """Numbers of moved and resting coordinates with a finite standard deviation."""
     far: int = 0
     """Number of coordinates beyond :data:`FAR` standard deviations."""
     worst: float = 0.0

@@ -1,9 +1,9 @@
-"""Measures the errors of a moving skin whose upper wires are sampled one after the other.
+"""Measures the errors for a moving skin whose upper wires are sampled sequentially.
 
 In each scene, a rigid body of the simulator is pressed into a bonded layer, held, moved along the skin, held
-and released, at one speed. The simulated patch samples its upper wires one after the other. The true field is
-the field at the time at which the first upper wire is sampled. The fields of a tracker are evaluated without
-and with the correction that the option ``row_time_s`` applies.
+again and released, all at one speed. The simulated patch samples its upper wires sequentially. The true field
+is the field at the moment the first upper wire is sampled. A tracker's fields are evaluated with and without
+the correction that the option ``row_time_s`` applies.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SLIDE_S: Final = 0.4
 HELD: Final = 4
 """Number of scans before, between and after the motions."""
 KNOTS: Final = 9
-"""Number of positions at which the contact of a motion is computed; in between, it is interpolated."""
+"""Number of positions at which the contact is computed during a motion; it is interpolated in between."""
 FAR_MOST: Final = 1e-3
 """Maximum fraction of coordinates beyond :data:`FAR` standard deviations."""
 RATIO_MOST: Final = 1.02
@@ -65,20 +65,20 @@ class Motion:
     """Start and end (s) of each motion, and displacement (m) as a function of its progress from 0 to 1."""
 
     def at(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the electrodes, m; at rest, the array :attr:`upper_m` itself."""
+        """Return the (U, N, 3) electrode positions in metres; at rest, the array :attr:`upper_m` itself."""
         if not self.parts[0][0] < t_s < self.parts[-1][1]:
             return self.upper_m
         start, end, moved_m = [part for part in self.parts if part[0] < t_s][-1]
         return np.asarray(self.upper_m + moved_m(glide((t_s - start) / (end - start))))
 
     def moves(self, since_s: float, until_s: float) -> bool:
-        """Return whether the body moves in an interval."""
+        """Return whether the body moves during an interval."""
         return any(start < until_s and since_s < end for start, end, _ in self.parts)
 
 
 @functools.lru_cache(maxsize=64)
 def _path(family: str, number: int, skin: Skin, ends: tuple[tuple[float, float], tuple[float, float]]) -> Any:
-    """Return the displacement (m) on a straight path between two depths and shifts, as a function."""
+    """Return a function for the displacement (m) along a straight path between two depths and shifts."""
     from scipy.interpolate import PchipInterpolator
 
     seed = [number, FAMILIES.index(family)]
@@ -126,10 +126,10 @@ def motion(family: str, number: int, skin: Skin, speed_m_s: float, period_s: flo
 
 @dataclass
 class Sum:
-    """Sums over the frames of one method without or with the correction."""
+    """Sums over the frames of one method, with or without the correction."""
 
     errors: list[float] = dataclasses.field(default_factory=list)
-    """Relative errors of the frames between which, or during which, the body moves."""
+    """Relative errors of the frames in which the body moves or has moved since the previous frame."""
     claims: list[float] = dataclasses.field(default_factory=list)
     """RMS standard deviations of these frames, relative to the RMS displacement."""
     squares_m2: list[float] = dataclasses.field(default_factory=list)
@@ -173,14 +173,14 @@ class Sum:
 
 
 def run(scenes: int, echo: Callable[[str], object] = lambda _: None) -> dict[str, Any]:
-    """Solve the scenes, and evaluate the fields without and with the correction.
+    """Solve the scenes, and evaluate the fields with and without the correction.
 
     Args:
         scenes: Number of scenes; the families alternate.
         echo: Function that prints a progress line.
 
     Returns:
-        One row per method, noise, scan period, row time and speed, and one row over all speeds.
+        One row per method, noise level, scan period, row time and speed, and one row for all speeds combined.
     """
     skin = Skin(preset(*LAYOUT))
     solvers = {
@@ -216,11 +216,11 @@ class Scan:
     """Scan of a moving skin."""
 
     ohm: Float
-    """(U, K), ohm: resistances, each upper wire at its own time."""
+    """(U, K), ohm: resistances, with each upper wire sampled at its own time."""
     truth_m: Float
-    """(U, N, 3), m: displacement at the time at which the first upper wire is sampled."""
+    """(U, N, 3), m: displacement when the first upper wire is sampled."""
     moves: bool
-    """Whether the body moves during this scan or since the scan before."""
+    """Whether the body moves during this scan or has moved since the previous scan."""
 
 
 def _scans(body: Motion, skin: Skin, period_s: float, row_s: float) -> list[Scan]:
@@ -245,7 +245,7 @@ def _solve(  # noqa: PLR0913 - solver, scans and sums by name
     noise: np.random.Generator,
     found: list[list[Sum]],
 ) -> None:
-    """Solve the scans and add the fields without and with the correction to the sums.
+    """Solve the scans and add the fields, with and without the correction, to the sums.
 
     A tracker with the option ``row_time_s`` applies the same correction to the same fields.
     """
@@ -283,7 +283,7 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 
 def _pairs(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Return the rows without correction, each with the corresponding row with correction."""
+    """Return pairs of corresponding rows: one without and one with the correction."""
     names = ("method", "sigma", "period_s", "row_s", "speed_m_s")
     corrected = {tuple(row[name] for name in names): row for row in rows if row["corrected"]}
     return [(row, corrected[tuple(row[name] for name in names)]) for row in rows if not row["corrected"]]

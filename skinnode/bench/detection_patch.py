@@ -121,7 +121,7 @@ class Patch:
 
 
 def load_of(kind: str, depth: float, layout: PatchLayout, rng: np.random.Generator) -> Load:
-    """Return a random load of a kind from :data:`skinnode.bench.accuracy_detection.FAMILIES`.
+    """Return a random load of one of the kinds in :data:`skinnode.bench.accuracy_detection.FAMILIES`.
 
     Args:
         kind: Kind of the load.

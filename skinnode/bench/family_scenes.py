@@ -69,8 +69,8 @@ def draw(  # noqa: PLR0913 - the parts of a scene
         rng: Random generator.
         bonded: Whether the body presses on a bonded layer; only for the families in :data:`BONDED`.
         depth: Depth divided by the height of the upper layer; random by default.
-        shift_m: Displacement of the loads from their random positions, in metres. With the same state of the
-            generator and a given depth, only the depth and the position of the loads change.
+        shift_m: Displacement of the loads from their random positions, in metres. Scenes generated from the
+            same generator state and with a given depth differ only in the depth and position of the loads.
     """
     layout = skin.layout
     loads: tuple[Load, ...] = (

@@ -81,7 +81,7 @@ class Generator:
         self._receive()
 
     def send_heartbeats(self, buses: Sequence[str]) -> None:
-        """Start sending the heartbeats of the patches on ``buses``, by which a host detects the patches."""
+        """Start sending heartbeats for the patches on ``buses``, so that a host can detect them."""
         self._pipe.send(list(buses))
 
     def begin(self) -> int:

@@ -1,4 +1,4 @@
-"""Sets up solvers with the best options for a hard case, and solves the streams of the case."""
+"""Sets up solvers with the best options for a hard case, and solves its streams."""
 
 from __future__ import annotations
 

@@ -291,7 +291,7 @@ def _read(host: Host) -> int:
 
 
 def _settle(host: Host) -> None:
-    """Wait until the host's counters no longer change."""
+    """Wait until the host's counters stop changing."""
     end_s, last = time.monotonic() + SETTLE_S, None
     while time.monotonic() < end_s:
         stats = host.stats()

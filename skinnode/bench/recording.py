@@ -33,7 +33,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.socketcan import HEADER
 
 FORMATS: Final = ((".mcap", True), (".mcap", False), (".log", False), (".blf", False))
-"""Formats as pairs: suffix, and True if the recording contains fields."""
+"""Formats as pairs: suffix, and whether the recording contains fields."""
 SEEKS: Final = 20
 HOUR_S: Final = 3600.0
 

@@ -76,7 +76,7 @@ def _measure(hand: HandConfig, generator: Generator, *, connected: bool) -> Row:
         stack.enter_context(without_long_collections())
         stack.enter_context(responsive_threads())
         host = stack.enter_context(Host.from_config(hand, open_port=DatagramPort))
-        # programs parse the hand like a hand file, which permits a bus load of at most 1
+        # programs parse the hand as a hand file, which permits a bus load of at most 1
         buses = tuple(bus.model_copy(update={"max_load": 1.0}) for bus in hand.buses)
         host.hand = hand.model_copy(update={"buses": buses})
         claim = stack.enter_context(Claim(hand, SessionOptions(port=PORT)))
@@ -117,7 +117,7 @@ def _unaccounted(published: dict[str, int], followed: Row) -> Row:
 
     Returns:
         ``received``, ``lost`` (gaps found by the program) and ``unaccounted``: fields that the daemon has
-        sent since the program's first field of the patch, but that the program neither received nor counted
+        sent since the program's first field from the patch, but that the program neither received nor counted
         as lost.
     """
     counts = followed.get("counts", {})

@@ -3,9 +3,9 @@
 A simulated hand has four patches per bus, and spheres press on some of its patches. The hands run in virtual
 time, so that every patch sends every scan even on a slow machine. The simulated buses take the duration of
 each frame into account. CPU time is read from the CPU clock of each thread: node threads count towards the
-simulator, all other threads towards the host. A bus has no thread of its own. When all threads wait, the last
-one to wait simulates the bus. The CPU time of the bus is measured separately and subtracted from that of the
-thread that simulated it.
+simulator, all other threads towards the host. A bus has no thread of its own. When all threads are waiting,
+the last one to start waiting simulates the bus. The CPU time of the bus is measured separately and subtracted
+from that of the thread that simulated it.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from vcan_sim.timed_interface import Segment, segment
 from vcan_sim.virtual_time import VirtualClock
 
 PATCHES: Final = (1, 4, 16, 64, 256, 1000)
-"""Default numbers of patches; in each hand, one patch is touched."""
+"""Default patch counts; one patch of each hand is touched."""
 MOST_FIELDS: Final = 4_000
 """Limit on the product of patches and scans per measurement, so that large hands take only a few minutes."""
 LEAST_SCANS: Final = 2
 """Minimum number of scans per measurement."""
 FIXED: Final = 16
-"""Number of patches in the hand whose number of touched patches is varied."""
+"""Number of patches in the hand used to vary the number of touched patches."""
 TOUCHED: Final = (0, 1, 4, 16)
 """Numbers of touched patches in the hand of :data:`FIXED` patches."""
 CHANGED_SCANS: Final = 100
@@ -68,7 +68,7 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
         ``host_ms``), the numbers of measured ``scans`` and solved ``fields``, the ratio of virtual to real
         time (``faster``), and the resident memory of the process (``memory_mb``).
     """
-    for count in patches:  # refuse a hand that is too large before measuring for minutes
+    for count in patches:  # reject an oversized hand now rather than after minutes of measurement
         hand_of(count)
     measure(1, 1, 2)  # compile the kernels and fill the caches
     contact = [measure(FIXED, count, scans) for count in TOUCHED]
@@ -84,7 +84,7 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
 
 
 def scans_of(patches: int, scans: int) -> int:
-    """Return the number of scans to measure on a hand, ``scans`` unless the hand is large."""
+    """Return the number of scans to measure on a hand: ``scans``, or fewer if the hand is large."""
     return min(scans, max(LEAST_SCANS, MOST_FIELDS // patches))
 
 
@@ -150,7 +150,7 @@ def physics() -> dict[str, float]:
 
 
 class _Skin:
-    """Simulates a patch, at a later time on each call."""
+    """Simulates a patch, advancing its time with each call."""
 
     def __init__(self, scene: PatchScene) -> None:
         self._patch, self._t_ns = SimulatedPatch(scene), 1_500_000_000

@@ -1,4 +1,4 @@
-"""Compares the host's counters with the numbers of frames sent and dropped in a soak test, by kind."""
+"""Compares the host's counters with the numbers of frames of each kind sent and dropped in a soak test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compares the speed of our solvers and other libraries' solvers, one wire at a time.
+"""Compares the speed of our solvers with that of other libraries' solvers, one wire at a time.
 
 All solvers use the same functions for the potential F and its Jacobian J. The benchmark solves each wire of
 the reference patch for a 10 % press, starting from the solution for a 9 % press. Every solver is timed at the

@@ -46,9 +46,9 @@ SHORT: Final[dict[str, Any]] = {
 }
 """Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans in a stream in which false alarms are counted; the stream contains ten touches."""
+"""Number of scans in a stream used to count false alarms; the stream contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Timeline of a touch in a stream in which false alarms are counted."""
+"""Timeline of a touch in a stream used to count false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
 """Timeline of a stream with two faults. The phases are short, because there are many such streams."""
 
@@ -67,7 +67,7 @@ class Item:
 
     @property
     def name(self) -> str:
-        """Unique name of the stream, from which its random generator is seeded."""
+        """Unique name of the stream, used to seed its random generator."""
         return f"{self.section} {self.row} {self.setting.name} {self.load} {self.number}"
 
 

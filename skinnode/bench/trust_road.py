@@ -92,7 +92,7 @@ def _together(kinds: tuple[dict[str, Any], ...], seed: int) -> list[dict[str, An
 
 
 def _patch(field: FieldFrame) -> str:
-    assert field.stamp is not None  # the host stamps every field
+    assert field.stamp is not None  # the host timestamps every field
     return field.stamp.patch
 
 

@@ -78,7 +78,7 @@ class Signal:
     bad: NDArray[np.bool_]
     """(T, U, K) bool: True where a fault changed the reading."""
     pressed: slice
-    """Range of the scans in which the load is at full depth."""
+    """Range of scans in which the load is at full depth."""
     phase: NDArray[np.int64]
     """(T,) conversion phase sent in each summary: 1, 2, 3, 1, …; always 0 if the patch does not count
     conversions."""

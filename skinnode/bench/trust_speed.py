@@ -1,4 +1,4 @@
-"""Compares the speed and error of the posterior, the exact inverse, and the inverse without data tests."""
+"""Compares the speed and error of the posterior and of the exact inverse with and without data tests."""
 
 from __future__ import annotations
 

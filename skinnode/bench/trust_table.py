@@ -1,4 +1,4 @@
-"""Regression tests for ``skinnode bench trust``: scenes in which earlier versions failed."""
+"""Regression tests for ``skinnode bench trust``: scenes on which earlier versions failed."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Compute :func:`skinnode.model.forward.resistance_ohm` about five times as fast."""
+        """Compute the same as :func:`skinnode.model.forward.resistance_ohm`, about five times as fast."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -334,8 +334,8 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
         radius: Minimum and maximum radius of the sphere, in pitches.
         shear: Maximum coefficient of friction.
         margin: Minimum distance from the centre to the border of the patch, in pitches.
-        where: ``inside``, ``edge`` or ``half off``. For ``edge``, the centre is on the patch's border in x;
-            for ``half off``, it is half a contact radius outside this border.
+        where: ``inside``, ``edge`` or ``half off``. For ``edge``, the centre is on the patch's border in the
+            x direction; for ``half off``, it is half a contact radius outside this border.
     """
     pitch = layout.pitch_m
     points = layout.upper_m[..., :2].reshape(-1, 2)

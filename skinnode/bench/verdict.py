@@ -125,7 +125,7 @@ class Tally:
         self._shares(np.where((converged & finite)[..., None, None], error, np.nan), std, truth_m)
 
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
-        """Add the error and standard deviation of the converged wires in the deepest frame.
+        """Add the error and standard deviation of the converged wires in the frame with the deepest press.
 
         Both are divided by the displacement in that frame. The worst error is the largest error in any frame,
         divided by the same displacement.

@@ -204,7 +204,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
     """Return the inhibit time (0x1800:3, unit 100 µs) that makes a scan last SCAN_SHARE of the SYNC period.
 
-    A scan lasts less than that if the object, an UNSIGNED16, cannot hold the inhibit time.
+    A scan is shorter if the required inhibit time does not fit in the object, an UNSIGNED16.
 
     Args:
         period_ms: SYNC period, in ms.
@@ -270,7 +270,8 @@ def _of_a_patch(
     period_s, beat_s, node_id = hand.sync.period_s, hand.bring_up.heartbeat_s, patch.node_id
     yield _classic(bus, f"EMCY of {patch.name}", od.emcy_cob_id(node_id), 8, beat_s)
     cob_id, length = od.chunk_cob_id(node_id), profile.chunk_bytes
-    # Chunks of up to 8 bytes, as of a patch with two lower wires, are classic frames on a CAN FD bus, too.
+    # Chunks of up to 8 bytes, such as those of a patch with two lower wires, are classic frames even on a CAN
+    # FD bus.
     times = _classic_s(bus, cob_id, length) if length <= 8 else _fd_s(bus, cob_id, length)
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     name = f"chunks of {patch.name}"

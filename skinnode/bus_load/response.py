@@ -6,8 +6,8 @@ wins arbitration, and a transmission is never preempted. The first instance of a
 slowest, so the analysis examines every instance in the longest busy period of the message's priority level.
 
 This module extends the analysis to messages sent in bursts, such as the chunks of a scan: each period begins
-with ``count`` frames at intervals of ``spacing_ns``. A time window contains the largest number of frames if
-it begins with a burst; this number replaces the paper's ⌈(t + J) / T⌉.
+with ``count`` frames at intervals of ``spacing_ns``. A time window contains the most frames if it begins with
+a burst; this number replaces the paper's ⌈(t + J) / T⌉.
 
 Two assumptions apply: no frame is retransmitted after an error, and every controller sends its
 highest-priority frame first.

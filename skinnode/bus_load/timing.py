@@ -61,7 +61,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum number of bits in a frame: stuff bits after the first 5 bits and every 4 more.
+    """Return the maximum number of bits in a frame: a stuff bit after the first 5 bits and every 4 more.
 
     Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """

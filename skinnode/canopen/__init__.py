@@ -2,6 +2,6 @@
 
 ``indices``, ``nmt``, ``abort``, ``emergency``, ``sdo`` and ``lss`` define constants such as indices, commands
 and error codes. ``dictionary`` and ``communication`` declare objects, and ``eds`` writes them as an EDS or
-DCF file. The conformance suite does not use this package, so that it remains an independent implementation of
+DCF file. The conformance suite does not use this package and thus remains an independent implementation of
 the standards.
 """

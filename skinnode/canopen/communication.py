@@ -19,7 +19,7 @@ class PdoDefault:
     """Default parameters of a PDO."""
 
     purpose: str
-    """Purpose of the PDO, which becomes part of the names of its records."""
+    """Purpose of the PDO, used in the names of its records."""
     cob_id: int
     """COB-ID with its flag bits, as in 0x1800:1, but without the node-ID if ``plus_node_id`` is true."""
     kind: int = 254

@@ -2,8 +2,7 @@
 
 An EDS (electronic data sheet) describes a type of device. A DCF (device configuration file) describes the
 configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as CiA 306
-tools expect. The Python library ``canopen`` expects decimal numbers, and ignores REAL32 defaults other than
-0.
+tools expect. The Python library ``canopen`` expects decimal numbers and ignores REAL32 defaults other than 0.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Description of a node; contained only in a DCF."""
+    """Description of a node; present only in a DCF."""
 
     node_id: int
     bitrate_kbps: int
@@ -120,7 +119,7 @@ def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     )
     if device is not None:
         yield from _section(
-            "DeviceComissioning",  # spelled like this in CiA 306
+            "DeviceComissioning",  # spelled this way in CiA 306
             [
                 ("NodeID", str(device.node_id)),
                 ("NodeName", device.node_name),

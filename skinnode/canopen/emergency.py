@@ -1,4 +1,4 @@
-"""Error codes of emergency messages (EMCY), and texts for these codes, the error register and error history.
+"""Emergency (EMCY) error codes, and texts for these codes, the error register and the error history.
 
 The codes are defined in CiA 301 v4.2, 7.2.7, tables 26 and 48. Patches of this project use some of them in a
 narrower sense. Manufacturer-specific bytes are decoded only if the sender is such a patch.
@@ -43,7 +43,7 @@ class EmcyCode(IntEnum):
 
 
 TOO_SLOW: Final = 1
-"""Third detail byte of EMCY 0x8110 if scans were skipped because the node's computer or the bus is too slow.
+"""Third detail byte of EMCY 0x8110 if scans were skipped because the node's computer or the bus was too slow.
 
 If the byte is 0, the scan period is too short to send all chunks at intervals of the inhibit time. The first
 two detail bytes are the number of skipped scans.
@@ -71,7 +71,7 @@ _OWN_CODES: Final[dict[int, str]] = {
     EmcyCode.PDO_NOT_PROCESSED: "PDO not processed: too short",
     EmcyCode.SOURCE: "no reading from the converter",
 }
-"""Texts for the error codes that a patch uses in a narrower sense than CiA 301."""
+"""Texts for the error codes that a patch uses in a narrower sense than CiA 301 does."""
 _CLASSES: Final = {
     0x10: "generic error",
     0x20: "current",

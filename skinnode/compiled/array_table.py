@@ -41,7 +41,7 @@ from numba.extending import register_model as typed_register_model
 from numba.np import arrayobj as typed_arrayobj
 from numpy.typing import NDArray
 
-cgutils: Any = typed_cgutils  # Any: numba's type hints do not allow this use
+cgutils: Any = typed_cgutils  # Any, because numba's type hints do not allow this use
 errors: Any = typed_errors
 imputils: Any = typed_imputils
 types: Any = typed_types
@@ -218,9 +218,9 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
     """Return a function that kernels use to access the fields of a table by name.
 
-    The function can only be called in compiled code. It raises TypeError if the table is not a ``made_of``.
-    Each field access reads the table again, so access fields outside loops. In kernels, bool arrays have the
-    element type uint8.
+    The function can only be called in compiled code. It raises TypeError if the table is not an instance of
+    ``made_of``. Each field access reads the table again, so access fields outside loops. In kernels, bool
+    arrays have the element type uint8.
     """
     view, digest = _ViewType(made_of), made_of._digest
     message = f"table: got a table of another class, must be the table of a {made_of.__name__}"

@@ -1,10 +1,10 @@
 """Decorators that compile kernels and cache them without risking stale code.
 
 Numba's own cache does not notice changes in other files whose functions a kernel calls. The name of the cache
-folder (:mod:`skinnode.compiled.kernel_cache`) therefore contains a digest of all files with kernels, and a
-change in any of them recompiles all kernels. The folder is created in ``$SKINNODE_CACHE_DIR``, in the user's
-cache folder or in the system's temporary folder, whichever is writable first. If none is writable, kernels
-are not cached.
+folder (:mod:`skinnode.compiled.kernel_cache`) therefore contains a digest of all files with kernels; a change
+in any of them causes all kernels to be recompiled. The folder is created in ``$SKINNODE_CACHE_DIR``, in the
+user's cache folder or in the system's temporary folder, whichever is writable first. If none is writable,
+kernels are not cached.
 
 Kernels are compiled with ``error_model="numpy"``, so that division by zero yields inf instead of raising an
 exception. Most are also compiled with ``nogil``, so that several threads can solve patches in parallel.
@@ -27,7 +27,7 @@ import numba as typed_numba
 
 from skinnode.compiled.kernel_cache import SUFFIX, KernelCache
 
-numba: Any = typed_numba  # Any: numba's type hints lack options used here
+numba: Any = typed_numba  # Any, because numba's type hints lack options used here
 _F = TypeVar("_F", bound=Callable[..., Any])
 _KERNEL_FILES = (
     "compiled/*.py",

@@ -5,7 +5,7 @@ every run, and damaged machine code is executed. Moreover, all signatures of a f
 so two processes that compile different signatures at the same time may load each other's code.
 
 This cache has a separate file for each compiled signature. The file contains a magic number, the SHA-256 of
-the payload, and the payload. Its name contains a digest of all inputs to the compilation, so that no index is
+the payload, and the payload. Its name contains a digest of all inputs to the compilation, so no index is
 needed. Files are replaced atomically. A file that fails the check is removed, and the kernel is compiled
 again. The removal of a file, or a failure to write one, is logged in one line; no exception reaches the
 caller.
@@ -96,7 +96,7 @@ class KernelCache:
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write the compiled code for ``signature`` to the cache, if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache excludes these, too
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache also excludes these
             return
         path = self._path(signature, compiled.codegen)
         try:

@@ -25,7 +25,7 @@ from numba.core.typing import templates as typed_templates
 
 from skinnode.compiled.jit import numba
 
-extending: Any = typed_extending  # Any: numba's type hints do not allow this use
+extending: Any = typed_extending  # Any, because numba's type hints do not allow this use
 types: Any = typed_types
 templates: Any = typed_templates
 signature: Any = templates.signature

@@ -1,4 +1,4 @@
-"""Checks that frames arrive with an expected period.
+"""Checks that frames arrive at an expected period.
 
 The check must tolerate individual frames that a busy machine receives late. A late frame lengthens one
 interval and shortens the next, so it hardly changes the mean, and a few late frames do not change the median.
@@ -21,7 +21,7 @@ def gaps_ms(frames: Sequence[Frame]) -> list[float]:
 
 
 def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_sooner: bool = False) -> None:
-    """Raise Failed unless frames arrive with the period ``period_ms``.
+    """Raise Failed unless the period of the frames is ``period_ms``.
 
     Args:
         frames: At least two frames.

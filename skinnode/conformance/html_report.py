@@ -72,7 +72,7 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 
 
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
-    """Return the report as an HTML page, in which failed cases are expanded.
+    """Return the report as an HTML page with the failed cases expanded.
 
     Args:
         report: Results of the run.

@@ -185,7 +185,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Discard frames with ``can_id`` until none has arrived for 20 ms, but for at most half a second."""
+    """Discard frames with ``can_id`` until none has arrived for 20 ms or half a second has passed."""
     end_s = clock.monotonic() + 0.5
     while clock.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

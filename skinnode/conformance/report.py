@@ -71,8 +71,8 @@ def as_json(report: Report) -> dict[str, Any]:
 def as_junit(report: Report) -> str:
     """Return the results as JUnit XML with one test suite per area.
 
-    A failed test contains the recorded frames. A case that is not applicable is a skipped test. A warning is
-    a passed test with output.
+    A failed test contains the recorded frames. A case that is not applicable is reported as a skipped test. A
+    warning is reported as a passed test with output.
     """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}

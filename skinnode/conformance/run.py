@@ -20,7 +20,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of consecutive cases without a response to the reset after which the remaining cases are not run."""
+"""Number of consecutive cases with no response to the reset after which the remaining cases are skipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
             results.append(result)
             say(result)
             problems += _put_back(dut, before)
-    finally:  # also if the user interrupts the run
+    finally:  # even if the user interrupts the run
         problems += _put_back(dut, before)
         if silent < SILENT_CASES:
             _reset(dut)
@@ -154,7 +154,7 @@ def _put_back(dut: Dut, before: dict[tuple[int, int], bytes]) -> list[str]:
         problems = write_back(dut, before)
     except (Failed, NodeTimeout) as failure:
         problems = [f"the configuration could not be restored: {failure}"]
-    dut.stored = False  # not if the user interrupts the restoration: it is then done again
+    dut.stored = False  # not if the user interrupts the restoration, which is then repeated
     return problems
 
 

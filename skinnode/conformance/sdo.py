@@ -220,7 +220,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Return the data and the segment count of a sub-block, and True if it is the last sub-block."""
+        """Return the data and segment count of a sub-block, and whether it is the last sub-block."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)

@@ -35,7 +35,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time without a new field after which all scans of the current SYNC are considered solved, in s."""
+"""Time without a new field, in s, after which all scans of the current SYNC are considered solved."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,11 @@ LONGEST_HEARTBEAT_S: Final = 2.5
 """Maximum wait for a heartbeat whose period is unknown, in s. Heartbeats with a longer period are missed."""
 
 LONGEST_KNOWN_HEARTBEAT_S: Final = 15.1
-"""Maximum wait for a heartbeat whose period is known, in s. It suffices for the longest period that a hand
-file can set, 10 s."""
+"""Maximum wait for a heartbeat whose period is known, in s. This covers the longest period that a hand file
+can set, 10 s."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum times to wait for the responses to the first and the second remote frame, in s.
+"""Maximum waits for the responses to the first and the second remote frame, in s.
 
 The second remote frame is sent in case the node was too busy to answer the first.
 """
@@ -87,7 +87,7 @@ class BusConnection(Closing):
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """End the SDO transfers and waits in all threads; each of them raises Abandoned."""
+        """End all SDO transfers and waits, in all threads; each of them raises Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
@@ -98,7 +98,7 @@ class BusConnection(Closing):
             within_s: Maximum wait, in s.
 
         Returns:
-            True if the condition became true, False after ``within_s``.
+            True if the condition became true, False if ``within_s`` elapsed first.
 
         Raises:
             BusError: The bus failed during the wait.
@@ -126,7 +126,7 @@ class BusConnection(Closing):
         return [data for t_ns, data in answers if t_ns >= since_ns]
 
     def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
-        """Check that a node answers SDO requests, with one retry.
+        """Check that a node answers SDO requests, retrying once.
 
         Args:
             node_id: The node.

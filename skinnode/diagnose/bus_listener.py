@@ -46,7 +46,7 @@ class NodeTraffic:
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
     """Reception time (ns) and eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Reception time (ns) and data of the newest frame of any length with the SDO response COB-ID."""
+    """Reception time (ns) and data of the newest frame, of any length, with the SDO response COB-ID."""
 
 
 class BusListener:

@@ -34,7 +34,7 @@ SCANS: Final = 50
 """Number of scans to capture; with 50 scans, the error in the estimated noise is about 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum duration of the capture in s, unless :data:`LEAST_PERIODS` SYNC periods take longer."""
+"""Maximum duration of the capture, in s, unless :data:`LEAST_PERIODS` SYNC periods take longer."""
 
 LEAST_PERIODS: Final = 1.5
 """Minimum duration of the capture in SYNC periods. The first scan may have begun before the capture and is

@@ -28,7 +28,8 @@ capacity."""
 
 PACE_FRAMES: Final = 3
 """Interval between requests at a low bit rate, in frames: a request, its response and one other frame. With
-shorter intervals, requests would wait until their responses are too late or the send buffer is full."""
+shorter intervals, requests would queue up until their responses arrive too late or the send buffer is
+full."""
 
 ANSWER_S: Final = 0.12
 """Time to wait for responses after the last request in a sweep, in s."""
@@ -274,8 +275,8 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 def _two_serials(connection: BusConnection, node_id: int) -> str:
     """Return evidence that two nodes have this node-ID.
 
-    The text is empty if a new request gets only one response; the second response during the sweep then
-    belonged to an earlier request.
+    The text is empty if a new request gets only one response; in that case, the second response during the
+    sweep belonged to an earlier request.
     """
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]

@@ -13,7 +13,7 @@ from skinnode.diagnose.bus_connection import BusConnection, State
 from skinnode.process import clock
 
 FOLLOW_S: Final = 1.5
-"""Maximum time for a node to report its new state in s, in addition to two heartbeat periods."""
+"""Maximum time for a node to report its new state, in s, in addition to two heartbeat periods."""
 
 BOOT_S: Final = 5.0
 """Maximum boot time of a node, in s."""

@@ -116,7 +116,8 @@ class ScanCapture:
     def _sync_ns(self, scan: Scan) -> int | None:
         """Return the time of the SYNC that started a scan, in ns; None if the SYNC was not received.
 
-        Searches backwards from the scan's first frame for a SYNC with the scan's counter or no counter.
+        Searches backwards from the scan's first frame for a SYNC that has either the scan's counter or no
+        counter.
         """
         for t_ns, number in reversed(list(self.syncs)):  # copied, because another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:

@@ -86,9 +86,9 @@ _MANY: Final = (
     (range(0x1A00, 0x1C00), _Object("TPDO mapping parameter", _U32, "rw", array=True)),
 )
 SINGLE: Final = tuple(_ONE)
-"""Indices of the objects that a device has only once, if at all."""
+"""Indices of objects that occur at most once in a device."""
 SERIES: Final = tuple(indices for indices, _ in _MANY)
-"""Index ranges of the objects that a device may have several times. A device uses the lowest indices of a
+"""Index ranges of objects that may occur several times in a device. A device uses the lowest indices of a
 range."""
 
 

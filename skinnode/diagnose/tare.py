@@ -28,7 +28,7 @@ from skinnode.process import clock
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Time without SDO frames after which an SDO channel is considered idle, in s."""
+"""Time without SDO frames, in s, after which an SDO channel is considered idle."""
 
 HOST_BEGINS_S: Final = 1.0
 """Maximum time in seconds, in addition to one SYNC period, from the tare to a running host's first SDO
@@ -58,9 +58,9 @@ class Tared:
     median_change: float | None = None
     """Median of (new R0 / old R0) − 1; None if there were no old R0 values."""
     touched_crossings: int = 0
-    """Number of crossings whose R0 changed as if touched during this or the previous tare."""
+    """Number of crossings whose change in R0 suggests a touch during this or the previous tare."""
     touched_change: float = 0.0
-    """Largest relative change of these crossings, after subtracting the changes of their wires."""
+    """Largest relative change among these crossings, after subtracting the changes of their wires."""
 
     @property
     def done(self) -> bool:

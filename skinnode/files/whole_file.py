@@ -1,9 +1,9 @@
 """Writes files atomically.
 
-The new content is written to a temporary file with a random name in the same folder; then this file is
-renamed. Readers therefore see either the complete old content or the complete new content. If writing fails,
-the file keeps its old content. The temporary file is always newly created, never opened through a symbolic
-link.
+The new content is written to a temporary file with a random name in the same folder, and the temporary file
+is then renamed. Readers therefore see either the complete old content or the complete new content. If writing
+fails, the file keeps its old content. The temporary file is always newly created, never opened through a
+symbolic link.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Predict when the next scan of a patch will end, so that the receiver can read its frames in one batch.
 
-On a fully loaded bus, successive scans may not end exactly one period apart. If heartbeats delay the frames
-of several nodes, the end of a scan may alternate between two phases of the scan period. The prediction
+On a fully loaded bus, successive scans do not always end exactly one period apart. If heartbeats delay the
+frames of several nodes, the end of a scan may alternate between two phases of the scan period. The prediction
 therefore includes every phase at which a recent scan has ended.
 """
 

@@ -94,7 +94,7 @@ class FieldCallback:
 
 
 class Callbacks:
-    """Callbacks of a host. Exceptions outside the users' functions are reported to ``defects``."""
+    """Callbacks of a host. Exceptions raised outside the users' functions are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects

@@ -86,7 +86,7 @@ class Defects:
             self._logged.add(text)
         if known:
             return
-        with contextlib.suppress(Exception):  # an application's log handler may raise
+        with contextlib.suppress(Exception):  # an application's log handler may raise an exception
             _log.warning("%s: %s; retrying", self.subject, text)
             _log.debug("%s: %s", self.subject, text, exc_info=error)
         failure = SkinError(f"{self.subject}: {text}")

@@ -21,8 +21,8 @@ scans in which no code changes. A converter counts as stopped if all of these co
 
 **Doubt.** A few repeated scans do not prove that a converter has stopped, but the fields may still show a
 press that has ended. If all codes stop changing in the middle of a movement, the next ``DOUBT_RUN`` fields
-are therefore not trusted. This rule applies only to patches without a phase whose codes are noisy and have
-never all repeated before.
+are therefore not trusted. This rule applies only to patches that send no phase and whose codes are noisy and
+have never all repeated before.
 
 If neither the phase nor the codes are conclusive and no code has changed for a second, the state is unknown
 (:attr:`Alive.CANNOT_TELL`).
@@ -67,15 +67,15 @@ DOUBT_RUN: Final = 64
 mid-press were detected within 11 scans, a few after more than 16.
 """
 FLICKERS: Final = 5
-"""Minimum number of scans in which a code returns to its value before the last change, for a patch's codes to
-count as noisy.
+"""Number of scans in which a code must return to the value it had before its last change for a patch's codes
+to count as noisy.
 """
 LONGER: Final = 4
 """Minimum length of a run that counts as frozen, as a multiple of the longest run while the converter was
 running.
 """
 PROOF_NS: Final = 1_000_000_000
-"""Time (ns) for which a change in a code or the phase proves that the converter is running."""
+"""Time (ns) for which a change in a code or in the phase counts as proof that the converter is running."""
 PHASES_REPEATED: Final = 3
 """Number of scans without a new conversion after which a patch is reported as frozen. A patch also becomes
 stale after this number of missed scans. Even the field of the first such scan is not trusted.

@@ -45,7 +45,7 @@ class BusStats:
     foreign: int
     """Number of data frames with a COB-ID that has no handler."""
     ignored: int
-    """Number of remote and extended frames and, on a bus without ``fd``, CAN FD frames. All of these are
+    """Number of remote frames, extended frames and, on a bus without ``fd``, CAN FD frames. All of these are
     ignored.
     """
     error_frames: int

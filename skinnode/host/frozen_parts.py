@@ -60,7 +60,7 @@ presses on fault-free patches.
 """
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings whose runs are shorter than a quarter of the frozen wire's or
+"""Minimum fraction of the other crossings whose runs must be shorter than a quarter of the frozen wire's or
 crossing's run.
 """
 

@@ -70,7 +70,7 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 def check_eds(path: Path, profile: PatchProfile) -> None:
     """Check an EDS file against a patch's PDO format.
 
-    The file may describe the summary with or without the check over the codes.
+    The file may describe the summary with or without the check value for the codes.
 
     Raises:
         ConfigError: if the file cannot be read.

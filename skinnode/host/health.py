@@ -112,8 +112,8 @@ class PatchHealth:
     by the next bring-up.
     """
     slow_overruns: int = 0
-    """Number of EMCY messages (code 0x8110) about scans that the node skipped because the computer running it
-    or the bus was too slow.
+    """Number of EMCY messages (code 0x8110) about scans that the node skipped because its computer or the bus
+    was too slow.
     """
     baselines: int = 0
     """Number of new baselines that the host has read, for example after a tare."""
@@ -208,7 +208,7 @@ class Evidence:
     """Evidence for the condition of a patch.
 
     ``late_heartbeats`` and ``late_scans`` are the ages of the newest heartbeat and scan, in heartbeat periods
-    and scan periods; None before the first one.
+    and scan periods respectively; None before the first one.
     """
 
     nmt_state: int | None

@@ -55,7 +55,7 @@ class HealthWatch:
     """Publishes changes in the health of all patches and buses, and the onsets and releases of touches.
 
     Threads: a dedicated thread checks the health, from :meth:`__enter__` until :meth:`close`. Without that
-    thread, the caller calls :meth:`check`.
+    thread, the caller must call :meth:`check`.
 
     Args:
         patches: Function that returns the health of each patch.

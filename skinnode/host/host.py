@@ -248,8 +248,8 @@ class Host(RunningHand):
     ) -> None:
         """Tare a patch: make its current resistances the baseline.
 
-        The host commands the tare with RPDO1. The call returns once the host has read the new baseline and
-        solves scans with it. Every event subscriber receives a ``baselines`` event. The node loses the new
+        The host commands the tare with RPDO1. The call returns once the host has read the new baseline and is
+        using it to solve scans. Every event subscriber receives a ``baselines`` event. The node loses the new
         baseline at power-off unless it is stored (0x1010).
 
         Args:

@@ -105,8 +105,8 @@ class BusLink(Dispatcher, Closing):
         Args:
             node_id: Node-ID of the node.
             on_answer: Function called with the monotonic time (ns) of each SDO response, on the mainline.
-            defects: Collector of the response handler's exceptions; see :meth:`handle`. If given, unexpected
-                exceptions during a transfer are reported to the bus's collector.
+            defects: Collector of the response handler's exceptions; see :meth:`handle`. If it is given,
+                unexpected exceptions during a transfer are reported to the bus's collector.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:

@@ -22,5 +22,5 @@ def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
 
 
 def reset(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Command a node to set all objects to their power-on values and to boot."""
+    """Command a node to reset all objects to their power-on values and to boot."""
     send(NMT_COB_ID, encode(NmtCommand.RESET_NODE, node_id))

@@ -25,8 +25,8 @@ class NodeFacts:
     heartbeat_s: float
     """Heartbeat period of the node, in seconds."""
     checked: bool = False
-    """Whether each scan's summary contains a check over all codes; False if the node's revision number is
-    unknown.
+    """Whether each scan's summary contains a check value for all codes; False if the node's revision number
+    is unknown.
     """
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:

@@ -79,8 +79,8 @@ class NodeMonitor:
         self._registers_said = 0
         self._last_emergency: tuple[int, bytes] | None = None  # error code, other bytes
         self.running = False
-        """Whether the host has started the node. From then on, an unexpected boot-up message means a restart
-        without a command.
+        """Whether the host has started the node. From then on, an unexpected boot-up message means that the
+        node has restarted without a command.
         """
         self._expected_until_ns = 0
         self.rejoins = self.baselines = 0
@@ -131,7 +131,7 @@ class NodeMonitor:
 
     def forget_beats(self) -> None:
         """Forget the heartbeats received so far, because their period may have changed."""
-        self._beats = deque(maxlen=BEATS)  # a new one, because other threads read the old one
+        self._beats = deque(maxlen=BEATS)  # replaced, not modified, because other threads read the old one
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY message.
@@ -174,7 +174,7 @@ class NodeMonitor:
         self._registers_said += 1
 
     def said_since(self, state: int, t_ns: int) -> bool:
-        """Return whether the newest heartbeat arrived after ``t_ns`` and reports NMT state ``state``."""
+        """Return whether the newest heartbeat arrived after ``t_ns`` and reported NMT state ``state``."""
         heard_ns = self._t_heartbeat_ns
         return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
 
@@ -256,7 +256,7 @@ class NodeMonitor:
         )
 
     def _emergency_text(self, code: int, detail: bytes) -> str:
-        """Return the description of an EMCY message.
+        """Return a description of an EMCY message.
 
         A refused node may be another type of device, so skinnode's own error texts do not apply to it.
         """

@@ -23,11 +23,11 @@ START_DEADLINE_S: Final = 1.0
 """Minimum time limit (s) from the start command to the first heartbeat that reports operational."""
 
 START_HEARTBEATS: Final = 4
-"""Number of heartbeat periods that this time limit contains at least."""
+"""Minimum length of this time limit, in heartbeat periods."""
 
 _PROBE_NS: Final = 250_000_000
 """Interval (ns) between requests to an absent node. The requests reveal a node that sends no heartbeats and
-whose boot-up message was lost. For four nodes, the requests use 0.1 % of a bus's capacity.
+whose boot-up message was lost. Requests to four nodes use 0.1 % of a bus's capacity.
 """
 
 _SEARCH_NS: Final = 1_000_000_000

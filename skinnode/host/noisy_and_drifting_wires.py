@@ -4,11 +4,11 @@ The tests for noise and drift evaluate windows of ``WINDOW`` successive scans. A
 been noisy, or drifting, in ``WINDOWS`` consecutive windows.
 
 **Noise.** The noise power of a wire is estimated from the second differences of its codes over time, which
-are zero for a steady change. A wire is noisy if its noise power exceeds ``NOISY`` times the expected noise
-power and ``NOISY`` times the median over all upper or all lower wires, respectively.
+are zero for a steady change. A wire is noisy if its noise power exceeds both ``NOISY`` times the expected
+noise power and ``NOISY`` times the median over all wires of its kind (upper or lower).
 
 **Drift.** A wire drifts if the resistances of all its crossings have changed by the same fraction of R0 but
-those of the adjacent wires have not. The change must exceed ``DRIFT`` relative to R0 and relative to the
+those of the adjacent wires have not. The change must exceed ``DRIFT`` both relative to R0 and relative to the
 median wire. A touch does not meet these conditions: it changes the crossings of a wire unevenly, and the
 rubber carries the change to the adjacent wires. None of 780,000 simulated touches that changed a wire by more
 than ``DRIFT`` was mistaken for drift. The test misses drift that affects adjacent wires equally, and drift of
@@ -124,8 +124,8 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
     A crossing counts as noiseless if its codes span fewer than three values. Two values are not enough,
     because even without noise a resistance at the edge of a quantization step may alternate between two
-    codes. A crossing also counts as noiseless if its mean code changes significantly from the first to the
-    second half of the window.
+    codes. A crossing also counts as noiseless if its mean code changes significantly between the first and
+    second halves of the window.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
@@ -156,7 +156,7 @@ def _of_wires(
 ) -> NDArray[np.float64]:
     """Reduce the values of the crossings on each wire to one value; NaN if none was measured.
 
-    NaN in ``values`` marks a crossing that was not measured. If there is no NaN, ``plain`` replaces
+    NaN in ``values`` marks a crossing that was not measured. If there is no NaN, ``plain`` is used instead of
     ``without_nan``, because it takes a tenth of the time.
     """
     if not np.isnan(values).any():

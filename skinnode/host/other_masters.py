@@ -16,7 +16,7 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Minimum time (ns) between two frames of the same type from other masters for the second to be logged."""
+"""Gap (ns) in the frames of one type from other masters after which the next such frame is logged."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"
 
@@ -25,7 +25,7 @@ SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's 
 class OtherMasterStats:
     """Counters of frames received from other masters.
 
-    On a bus that another master runs, SYNC and NMT commands are legitimate: ``syncs`` and ``nmt_commands``
+    On a bus that another master runs, SYNC and NMT commands are legitimate, so ``syncs`` and ``nmt_commands``
     stay 0.
     """
 

@@ -87,11 +87,11 @@ class StreamTap(Protocol):
 
 
 def _ignore(scan: Scan) -> None:
-    """Do nothing; default of the callbacks in :class:`StreamOptions`."""
+    """Do nothing; default for the callbacks in :class:`StreamOptions`."""
 
 
 def _find_nothing(scan: Scan, number: int) -> Verdict:
-    """Return a fault-free verdict; default of :attr:`StreamOptions.judge`."""
+    """Return a fault-free verdict; default for :attr:`StreamOptions.judge`."""
     return FAULTLESS
 
 
@@ -155,8 +155,7 @@ class PatchStream:
         self.withholdings = 0
         """Number of calls to :meth:`withhold`."""
         self.doubtful = False
-        """Whether a summary that was lost or discarded, or a scan that was missed, may have announced a new
-        baseline."""
+        """Whether a lost or discarded summary, or a missed scan, may have announced a new baseline."""
         self._next_scan: int | None = None  # number of the next scan if none is missed; None before the first
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
@@ -386,7 +385,7 @@ class PatchStream:
     def stats(self) -> StreamStats:
         """Return all counters of the stream.
 
-        The counters are read in an order that never counts a scan in progress as skipped.
+        The counters are read in such an order that a scan in progress is never counted as skipped.
         """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(

@@ -27,8 +27,8 @@ second, unless the bus is unavailable.
 """
 
 _ANSWER_S: Final = 0.05
-"""Time (s) to collect the responses to one SDO request when looking for a second node with the same node-ID.
-The search prolongs a failed bring-up by at least twice this time.
+"""Time (s) for which responses to one SDO request are collected when looking for a second node with the same
+node-ID. The search prolongs a failed bring-up by at least twice this time.
 """
 
 _MUTE_S: Final = 0.4
@@ -268,7 +268,7 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the host is the NMT master and knows the serial number, as an LSS search requires."""
+        """Whether the host is the NMT master and knows the serial number; an LSS search requires both."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:

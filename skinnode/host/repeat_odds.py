@@ -4,7 +4,7 @@ A reading repeats the previous code with a probability of at most 2Φ(1/2σ) −
 deviation of the noise in codes. This maximum is reached if the true value lies in the middle of a
 quantization step, as it does at rest after a tare.
 
-Under a press, the crossings have different values, whose positions within their quantization steps are
+During a press, the crossings have different values, whose positions within their quantization steps are
 practically random. For a random position, n + 1 readings of one crossing all yield the same code with
 probability E max(0, 1 − σ R), where R is the range of n + 1 standard normal variables. This is much less than
 the maximum, even for a converter with little noise.

@@ -1,4 +1,4 @@
-"""Define the interface to a running hand, which does not depend on the process that runs the hand."""
+"""Define an interface to a running hand that does not depend on which process runs the hand."""
 
 from __future__ import annotations
 

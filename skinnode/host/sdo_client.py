@@ -2,7 +2,7 @@
 
 The SDO client of the canopen package blocks the calling thread until the mainline delivers the response
 through :meth:`SkinNetwork.notify`. It does not limit the length or duration of a transfer, so a faulty node
-could exhaust the memory or block a thread forever. This module adds both limits.
+could exhaust memory or block a thread forever. This module adds both limits.
 
 Threads: only one thread at a time may access a node. Different nodes may be accessed in parallel.
 """

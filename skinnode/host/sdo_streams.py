@@ -43,8 +43,8 @@ _SETTLE_S: Final = 0.1
 """Time limit (s) for responses to cease after an abort. Another SDO client may keep the node responding."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmissions in one transfer. If a node requests more than this, it probably rejects
-every block, so the transfer fails.
+"""Maximum number of retransmissions in one transfer. If a node requests more than this, it is probably
+rejecting every block, so the transfer fails.
 """
 
 _SEQUENCE: Final = 0x7F
@@ -131,7 +131,7 @@ class BlockUpload(BlockUploadStream):
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # canopen is not typed
 
     def _retransmit(self) -> bytes:
-        """Request all segments after the last valid one again, and return the first of these segments.
+        """Request again all segments after the last valid one, and return the first of them.
 
         Raises:
             SdoError: if the segment does not arrive in time, or the response is an abort.

@@ -145,7 +145,7 @@ class _Start:
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
         """Return the solver of a node; None if the node may join later.
 
-        Raises the error if it prevents the start.
+        An error that prevents the start is raised.
         """
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):

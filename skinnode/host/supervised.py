@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Time limit (s) for the first SDO response and the tare, once the node has sent a frame."""
+"""Time limit (s) for the first SDO response, and for the tare, once the node has sent a frame."""
 
 LEAST_NS: Final = 300_000_000
 """Minimum time (ns) between two bring-ups of a node that restarts in a loop."""
@@ -77,7 +77,7 @@ class Supervised:
     defects: int = 0
     """Number of unexpected exceptions that the supervisor has already handled."""
     upset: bool = False
-    """Whether supervising the node has raised an exception, so that its state is unknown."""
+    """Whether supervising the node has raised an exception, leaving the node's state unknown."""
     probe_ns: int = 0
     search_ns: int = 0
     register_ns: int = 0

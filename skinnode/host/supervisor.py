@@ -1,12 +1,12 @@
 """Keep the nodes of a running hand operational.
 
-A node that appears late or reappears is configured and started. A changed baseline is reread. The supervision
-of one node does not depend on the others.
+A node that appears late or reappears is configured and started. A changed baseline is reread. Each node is
+supervised independently of the others.
 
 Fifty times a second, the supervisor's thread evaluates the mainline's information about each node and decides
 what to do. Any operation that waits for a node, such as its configuration, runs as a job on a thread pool. A
-node has at most one job at a time. LSS searches for absent nodes, of which a bus carries only one at a time,
-have threads of their own, so that no other job waits for them. The supervisor's thread also collects the
+node has at most one job at a time. LSS searches for absent nodes have threads of their own, so that no other
+job waits for them; a bus carries only one such search at a time. The supervisor's thread also collects the
 results of the jobs, so that no other thread accesses its state.
 
 =========  ========================================  =========================================

@@ -65,9 +65,9 @@ class Ticks:
     def find(self, counter: int) -> Tick | None:
         """Return the SYNC of a scan that has just arrived; None if no SYNC has had the scan's counter value.
 
-        If the SYNC was lost, the newest one with this counter value is older than the scan by a round of the
-        counter. The result then has the right number and the time 0. A SYNC that would be more than three
-        quarters of a round old is regarded as the lost SYNC of the next round.
+        If the SYNC was lost, the newest one with this counter value is one counter cycle older than the scan.
+        The result then has the right number and the time 0. A SYNC that would be more than three quarters of
+        a cycle old is regarded as the lost SYNC of the next cycle.
         """
         overflow = self.counter_overflow
         tick = self._ticks[counter] if 0 < counter <= overflow else None

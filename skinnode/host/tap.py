@@ -77,7 +77,7 @@ class ContainedTap:
 
 
 class _SentFrames:
-    """Passes the sent frames of a bus, and the numbers of SYNC messages, to a tap."""
+    """Passes the frames sent on a bus, and the numbers of SYNC messages, to a tap."""
 
     def __init__(self, tap: HostTap, bus: str, ticks: Ticks | None) -> None:
         self._tap, self._bus, self._ticks = tap, bus, ticks

@@ -10,7 +10,7 @@ from typing import Final
 from skinnode.model.frames import FieldFrame
 
 KEPT: Final = 4096
-"""Maximum number of changes queued for publication; when full, the oldest are dropped."""
+"""Maximum number of changes queued for publication; if the queue is full, the oldest changes are dropped."""
 
 
 @dataclass(frozen=True, slots=True)

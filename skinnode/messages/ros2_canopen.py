@@ -1,9 +1,9 @@
 """Writes the configuration of ros2_canopen, a CANopen master for ROS 2, for the buses of a hand.
 
-ros2_canopen reads ``bus.yml``. When its package is built, dcfgen of Lely CANopen generates the configuration
-of the master and of each node from ``bus.yml`` and the EDS files. At boot, the master writes to each patch
-the values that the host writes as the NMT master of the bus (:mod:`skinnode.host.configurator`), in the same
-order.
+ros2_canopen reads ``bus.yml``. When its package is built, Lely CANopen's dcfgen generates the configuration
+of the master and of each node from ``bus.yml`` and the EDS files. At boot, the master writes the same values
+to each patch, in the same order, as the host does when it is the NMT master of the bus
+(:mod:`skinnode.host.configurator`).
 
 The master does not receive the chunks. Otherwise, the proxy driver of ros2_canopen would put every mapped
 value of every chunk into an unbounded queue, from which it removes at most ten values per period

@@ -13,17 +13,17 @@ import numpy as np
 from skinnode.model.layout import Float
 
 LOCAL_CHANGE: Final = 0.002
-"""Minimum relative change of a crossing that a touch may have caused. In the model of the staggered preset, a
-press of 10 % of the layer thickness over three pitches changes the most affected reading by 0.8 %."""
+"""Minimum relative change of a crossing that is attributed to a touch. In the model of the staggered preset,
+a press of 10 % of the layer thickness over three pitches changes the most affected reading by 0.8 %."""
 
 NOISES: Final = 8.0
 """The same minimum, in standard deviations estimated from the changes' median absolute deviation."""
 
 LEAST_SHARE: Final = 0.01
 """Fraction of changed crossings above which a touch is reported. A smaller fraction probably results from
-defects of single crossings.
+defects in individual crossings.
 
-With 2.5e-4 noise in the baseline, as for rubber, the test detects presses of 20 % of the layer thickness, but
+With a baseline noise of 2.5e-4, as for rubber, the test detects presses of 20 % of the layer thickness, but
 not all presses of 10 %.
 """
 
@@ -32,14 +32,14 @@ TOUCHED: Final = "as if something touched the skin now or at the previous tare: 
 
 
 def touched_crossings(before_ohm: Float, after_ohm: Float) -> tuple[int, float]:
-    """Return the number of crossings that changed as if touched, and their largest change.
+    """Return the number of crossings that changed as if touched, and the largest change among them.
 
     Args:
         before_ohm: (U, K) old baseline, in ohms.
         after_ohm: (U, K) new baseline, in ohms.
 
     Returns:
-        The number of crossings whose relative change differs from those of their two wires by more than
+        The number of crossings whose relative changes differ from those of their two wires by more than both
         :data:`LOCAL_CHANGE` and :data:`NOISES` standard deviations, and the largest such difference. Both are
         0 if the fraction of such crossings is at most :data:`LEAST_SHARE`, or if no values can be compared.
     """

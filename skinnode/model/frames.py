@@ -35,15 +35,15 @@ class ScanStamp:
     10 bits. Object 0x2011:4 contains the node's time with a resolution of 1 µs.
     """
     t_sync_ns: int
-    """Time at which the SYNC of this scan was sent or received; 0 if unknown. The field belongs to this time,
+    """Time at which the SYNC of this scan was sent or received; 0 if unknown. The field applies to this time,
     apart from the constant delay until the node samples the first upper wire."""
     t_receive_ns: int
     """Time at which the last frame of the scan was received."""
     t_solved_ns: int = 0
     """Time at which the displacement field was ready; 0 if it is not ready yet."""
     run: int = 0
-    """Number of restarts of a remote hand's daemon since the program connected; 0 in a host. Scan numbers
-    restart in each run.
+    """Number of times that a remote hand's daemon has restarted since the program connected; 0 in a host.
+    Scan numbers restart in each run.
     """
 
     def solved_at(self, t_ns: int) -> ScanStamp:
@@ -132,9 +132,10 @@ class FieldFrame:
     displacement_m: Float
     """(U, N, 3) displacement from the rest position, in metres.
 
-    It belongs to the time of the scan, at which all upper wires were sampled. If they are sampled one after
+    It applies to the time of the scan, at which all upper wires were sampled. If they are sampled one after
     the other and the row time is configured (``row_time_us``), this is the time at which the first upper wire
-    was sampled; without a configured row time, each wire belongs to its own sampling time.
+    was sampled; without a configured row time, the displacement of each wire applies to that wire's own
+    sampling time.
     """
     displacement_std_m: Float
     """(U, N, 3) standard deviation due to noise in the resistances, in metres; inf where the displacement is
@@ -206,7 +207,7 @@ class FieldFrame:
     touch, independent loads on all cells also displace the skin; all octaves of depth, from a depth hidden by
     noise to 16 % of the layer height (RMS), are equally likely. The prior is a two-state Markov chain, with
     one touch per minute that lasts one second on average. ``touched`` does not depend on the odds, but on the
-    accepted number of false alarms.
+    permitted number of false alarms.
     """
     faults: tuple[DataFault, ...] = ()
     """Readings that failed a test and were not used to compute the field."""

@@ -26,8 +26,8 @@ the posterior method has 3072 rows and takes 75 MB.
 """
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of pairs of an upper and a lower electrode on a patch. At this size, the offset vectors of
-all pairs take 100 MB.
+"""Maximum number of upper-lower electrode pairs on a patch. At this size, the offset vectors of all pairs
+take 100 MB.
 """
 
 _HASH_RESOLUTION_M: Final = 1e-9

@@ -132,7 +132,7 @@ class MonitorApp(App[None]):
     def on_unmount(self) -> None:
         """End the recording, and remove the logging handler that adds warnings to the event log."""
         if self._source.recording is not None:
-            self._source.stop_recording()  # the source then tells what the recording lacks
+            self._source.stop_recording()  # the source then reports what the recording lacks
         logging.getLogger().removeHandler(self._records)
 
     @property

@@ -119,7 +119,7 @@ class HostSource(LiveSource):
     def __init__(self, host: Host) -> None:
         super().__init__(host, host.hand.name)
         self._host = host
-        self._lost: list[str] = []  # what the ended recordings lack
+        self._lost: list[str] = []  # what is missing from the recordings that have ended
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
@@ -131,7 +131,7 @@ class HostSource(LiveSource):
 
     @property
     def flaws(self) -> list[str]:
-        """Failures of the recordings that have ended, and the numbers of frames that they lack."""
+        """Failures of the recordings that have ended, and the number of frames missing from each."""
         return list(self._lost)
 
     @property

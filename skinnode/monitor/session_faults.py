@@ -74,7 +74,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return (key, text) pairs for wire faults, a duplicate node-ID and the last EMCY of a patch."""
+    """Return (key, text) pairs for a patch's wire faults, duplicate node-ID and last EMCY message."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:

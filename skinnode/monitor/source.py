@@ -141,7 +141,8 @@ def supplied_m(hand: HandConfig, layout: Callable[[str], PatchLayout]) -> dict[s
         layout: Function that returns the layout used to compute a patch's fields.
 
     Returns:
-        (U, N, 3) positions at rest by patch name, in m; as planned until the node has supplied its own.
+        (U, N, 3) positions at rest by patch name, in m; the planned positions until the node has supplied its
+        own.
     """
     return {
         patch.name: layout(patch.name).upper_m for patch in hand.patches if patch.layout.coordinates == "node"

@@ -62,7 +62,7 @@ class PatientDriver(LinuxDriver):
         self._gone = threading.Event()
         self._writer: _Writer | None = None
         self.torn = False
-        """Whether output was discarded because the queue was full, so that the screen must be redrawn."""
+        """Whether the screen must be redrawn because the queue was full and output was discarded."""
 
     def start_application_mode(self) -> None:
         """Start the writer thread, then enter application mode."""
@@ -80,7 +80,7 @@ class PatientDriver(LinuxDriver):
 
     @property
     def busy(self) -> bool:
-        """Whether the terminal has not yet accepted all queued output."""
+        """Whether queued output is still waiting for the terminal to accept it."""
         return self._writer is not None and self._writer.queue.qsize() > 0
 
     @property

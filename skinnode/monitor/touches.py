@@ -15,7 +15,7 @@ TOUCH: Final = 0.35
 contact, the rim is half as deep as the centre."""
 SURE: Final = 6.0
 """Minimum depth at which an electrode belongs to a touch, as a multiple of its standard deviation. With 100
-electrodes, noise alone exceeds this limit in one in 10 million fields."""
+electrodes, noise alone exceeds this limit in one field in 10 million."""
 LEAST_TOUCH_M: Final = 1e-5
 
 

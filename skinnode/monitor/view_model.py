@@ -1,4 +1,4 @@
-"""Computes the screen content from snapshots as immutable data."""
+"""Computes the screen content, as immutable data, from snapshots."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class Application(Protocol):
     def reset(self, *, everything: bool) -> None:
         """Restart the application's communication at power-on and after a reset.
 
-        If ``everything`` is true, reset its state, too: at power-on and after *reset node*, its objects
+        If ``everything`` is true (at power-on and after *reset node*), reset its state, too; its objects
         already have their power-on values. *Reset communication* keeps them.
         """
         ...

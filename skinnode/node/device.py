@@ -143,7 +143,7 @@ class CanopenDevice:
         if self._bit_rate_change.silent(t_ns):
             return
         self._now_ns = t_ns
-        # Before boot-up, only the LSS handler exists, if any.
+        # Before boot-up, the only handler, if any, is the LSS handler.
         if not remote and (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
         elif self.nmt_state is NmtState.INITIALISING:

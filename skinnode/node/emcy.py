@@ -142,7 +142,7 @@ class EmcyProducer:
     def _try(self, t_ns: int) -> None:
         """Send queued messages. A message that cannot be sent is retried at a later timer event.
 
-        No BusError is raised, because the caller is still handling the error that it reports.
+        No BusError is raised, because the caller is still handling the error that the message reports.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)

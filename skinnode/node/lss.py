@@ -115,8 +115,8 @@ class LssSlave:
         CiA 305 requires a slave to ignore frames that are not 8 bytes long, unknown commands, and requests
         that are not allowed in its current state, because these may be intended for other slaves.
 
-        After *activate bit timing*, the node is silent for twice the delay in the request and changes its bit
-        rate halfway through. The second half gives the other nodes time to change their bit rates.
+        After *activate bit timing*, the node is silent for twice the delay given in the request and changes
+        its bit rate halfway through. The second half gives the other nodes time to change their bit rates.
 
         Args:
             data: Payload of the frame.

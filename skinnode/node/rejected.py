@@ -12,7 +12,7 @@ _MOST: Final = 0xFFFF_FFFF
 
 
 class Rejected(IntEnum):
-    """Type of rejected frame. The value is the sub-index of its counter in 0x2040."""
+    """Type of rejected frame. Each value is the sub-index of the corresponding counter in 0x2040."""
 
     NMT = 1
     """NMT frame that is not two bytes long or contains an unknown command for this node."""

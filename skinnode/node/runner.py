@@ -39,7 +39,7 @@ class NodeRunner:
     """Runs a group of nodes from :meth:`start` until :meth:`stop`. A runner can be started only once.
 
     Bus errors do not stop the runner. While it runs, other threads may only read the counters of its nodes.
-    All timers have the precision of the most demanding node. The caller must close the port.
+    All timers have the precision required by the most demanding node. The caller must close the port.
 
     Args:
         port: CAN port that the nodes share.

@@ -68,7 +68,7 @@ class Storage:
 
     @property
     def kept(self) -> Kept:
-        """Contents of the memory; empty if the memory has no usable contents."""
+        """Memory contents; empty if none are usable."""
         return self._kept
 
     @property
@@ -142,7 +142,7 @@ class Storage:
             self._clear_verification()  # this is not the configuration that was verified
 
     def keep_baseline(self) -> None:
-        """Save the baseline if the node has a memory."""
+        """Save the baseline if the node has non-volatile memory."""
         if self._memory is None:
             return
         try:

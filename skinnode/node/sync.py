@@ -37,7 +37,7 @@ class SyncWindow:
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Forget the last SYNC and end all errors when the NMT state has changed."""
+        """Forget the last SYNC and clear all errors when the NMT state changes."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)

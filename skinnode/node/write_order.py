@@ -31,7 +31,7 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
         values: Saved bytes, by index and sub-index.
 
     Returns:
-        Objects that refused their values and keep their defaults. If an entry of a mapping is refused, the
+        Objects that refused their values and keep their defaults. If any entry of a mapping is refused, the
         whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}

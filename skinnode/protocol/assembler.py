@@ -8,10 +8,10 @@ arrives less than counter range × period − timeout after its SYNC. With the u
 limit is 237 periods.
 
 **Two scans with the same counter.** This happens if a node fails to increment the counter or two nodes share
-a node-ID. The assembler notices if two different frames arrive for the same chunk or summary. It cannot tell
-which scan the other frames belong to, so it discards all of them. It also discards an incomplete scan whose
-chunks arrived more than two periods apart, because they may belong to two scans. If no chunk arrived from
-both scans, only the scan check can detect the mixture.
+a node-ID. The assembler detects this if two different frames arrive for the same chunk or summary. It cannot
+tell which scan the other frames belong to, so it discards all of them. It also discards an incomplete scan
+whose chunks arrived more than two periods apart, because they may belong to two scans. If each chunk arrived
+from at most one of the two scans, only the scan check can detect the mixture.
 
 **Scan check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes of the patch, including those of unsent chunks (:mod:`skinnode.protocol.scan_check`). A failed check
@@ -23,7 +23,7 @@ check is rejected. If all chunks of a scan arrived but the check is impossible, 
 Patches of revision 1.0 send no checks, so their scans are complete once all chunks have arrived.
 
 **Order.** A frame starts a newer scan if its counter is ahead of the last scan's counter by at most half the
-counter range. Frames with other counters are late and are dropped. After a silence of one timeout, a frame
+counter range. Frames with other counters are late and are dropped. After one timeout without frames, a frame
 with any counter is accepted, because the node or the SYNC producer may have restarted.
 
 **Unsent chunks.** If the node sends only changed chunks, the other chunks keep their last codes
@@ -112,7 +112,7 @@ class ScanAssembler:
         self.on_discarded: Callable[[], None] | None = None
         """Callback for a discarded scan that may have announced a new baseline; None for no callback."""
 
-        # State of the open scan; if no scan is open, of the last scan.
+        # State of the open scan, or of the last scan if none is open.
         self._counter = _NONE_OPEN
         self._last_counter = _NEVER
         self._scan = _NEVER
@@ -216,7 +216,7 @@ class ScanAssembler:
     def next_deadline_ns(self) -> int | None:
         """Return the earliest time (ns) at which :meth:`poll` closes the open scan; None if no scan is open.
 
-        Every arriving frame can change this time.
+        This time can change whenever a frame arrives.
         """
         if self._counter == _NONE_OPEN:
             return None

@@ -80,7 +80,7 @@ def kit_files(profile: PatchProfile, layout: PatchLayout | None = None) -> dict[
 
 
 def may_replace(file: Path) -> bool:
-    """Return whether a kit file may be written: it does not exist yet or begins with :data:`MARK`.
+    """Return whether a kit file does not exist yet or begins with :data:`MARK`, and may therefore be written.
 
     Args:
         file: Path of the file.

@@ -1,4 +1,4 @@
-"""Restores the 32-bit device time of a node (µs) from the 16-bit time in a summary with a check."""
+"""Restores a node's 32-bit device time (µs) from the 16-bit time in a summary with a check."""
 
 from __future__ import annotations
 

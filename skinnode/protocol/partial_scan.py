@@ -43,7 +43,7 @@ class HeldChunks:
         self._payloads, self._decoded = received, None
 
     def decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
-        """Decode all stored payloads. Until they change, return the same read-only arrays.
+        """Decode all stored payloads. Until the codes change, return the same read-only arrays.
 
         Returns:
             (U, K) codes, with :data:`~skinnode.protocol.codes.MISSING` where unknown; a (U, K) mask of the

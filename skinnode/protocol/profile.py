@@ -132,7 +132,7 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of sequences into which the codes of a scan are divided before they are split into chunks.
+        """Number of sequences into which a scan's codes are divided before being split into chunks.
 
         A scan is one sequence on classic CAN, and one sequence per upper wire on CAN FD.
         """

@@ -34,7 +34,7 @@ class SelfTest(NamedTuple):
     faults: SelfTestFault
     readings: int
     noise: float
-    """Relative noise: RMS over all crossings of the relative standard deviation."""
+    """Relative noise: RMS, over all crossings, of the relative standard deviation."""
     open_wires: int
     shorted_wires: int
     out_of_range: int

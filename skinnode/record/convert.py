@@ -51,7 +51,7 @@ class Conversion:
     faults: tuple[str, ...]
     """Messages about missing or unreadable parts of the source."""
     notes: tuple[str, ...]
-    """Messages about assumptions and about data that the target cannot contain."""
+    """Messages about assumptions made and about data that the target cannot store."""
 
 
 class FieldTable(NewFile, Protocol):
@@ -71,7 +71,7 @@ def convert(
         target: New file.
         hand: Hand for a log without a journal; see :func:`skinnode.record.open_recording.open_log`.
         frames_only: Whether to omit the fields from an MCAP file. If the source is also an MCAP file, its
-            contacts, poses, health and events are omitted, too.
+            contacts, poses, health and events are also omitted.
 
     Raises:
         ConfigError: The source cannot be read, the target exists or cannot be written, the conversion is not
@@ -244,7 +244,7 @@ class CopiedFrames:
             yield logged
 
     def mark_damage(self) -> None:
-        """If frames before the last one were lost, write to the journal that this is a repaired recording.
+        """If frames before the last one were lost, note in the journal that this is a repaired recording.
 
         The frame counts in the journal do not match such a copy. A log that would share the journal of the
         source gets its own journal.
@@ -260,7 +260,7 @@ class CopiedFrames:
 
 
 def _losses(recording: OpenRecording, target: Path, tee: CopiedFrames) -> list[str]:
-    """Return at most one line that describes the data that the target cannot contain."""
+    """Return at most one line describing the data that the target cannot store."""
     lost = []
     from_mcap = recording.frames.path.suffix == MCAP
     if from_mcap and target.suffix != MCAP:

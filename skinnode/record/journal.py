@@ -74,8 +74,8 @@ _MOST_SYNCS: Final = 2**53
 _LONGEST_HEADER: Final = 32 << 20
 """Maximum length of the first line in bytes. The layout files of a hundred of the largest patches fit."""
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line in bytes. An event containing the baseline and layout of the largest patch fits; a
-longer line is read as several lines."""
+"""Maximum length of a line in bytes. Long enough for an event containing the baseline and layout of the
+largest patch; a longer line is read as several lines."""
 _BESIDE_FILE: Final = {"coordinates"}
 """Keys that a patch's layout table may contain in addition to the name of a layout file."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
@@ -120,7 +120,7 @@ def _hand_of(table: Mapping[str, Any], where: str) -> HandConfig:
 def _layoutless(table: Mapping[str, Any]) -> frozenset[str]:
     """Return the names of the patches whose layout file was omitted by an older version.
 
-    The older version removed the file name from the layout table. A table without keys other than
+    The older version removed the file name from the layout table. A table with no keys other than
     ``coordinates`` must therefore have contained a file name.
     """
     patches = [patch for patch in table["patches"] if "layout" in patch]

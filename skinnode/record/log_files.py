@@ -59,7 +59,7 @@ class LogFiles:
     def begin_journal(self, lines: Iterable[str]) -> None:
         """Give a log without a journal its own journal, which begins with ``lines``.
 
-        If a journal exists already, nothing changes.
+        If a journal already exists, nothing changes.
 
         Raises:
             ConfigError: The journal cannot be created.
@@ -89,7 +89,7 @@ class LogFiles:
 
     def discard(self) -> None:
         """Close and delete the files."""
-        with contextlib.suppress(Exception):  # the files may be closed already
+        with contextlib.suppress(Exception):  # the files may already be closed
             self.close()
         discard(self.path)
         if self._journal is not None:

@@ -133,7 +133,7 @@ class McapChunks:
                 at = end
                 continue
             following = _find_chunk(data, at + 1)
-            if end is None or opcode != Opcode.CHUNK:  # otherwise the damage is already recorded
+            if end is None or opcode != Opcode.CHUNK:  # otherwise, the damage has already been recorded
                 self.complain(at, TRUNCATED if following == size else "no record")
             at = following
 
@@ -198,7 +198,7 @@ def _is_plausible(data: mmap.mmap, at: int) -> bool:
 
 
 def _can_skip(index: ChunkIndex | None, length: int, wanted: Callable[[int], bool]) -> bool:
-    """Return whether a chunk's entry in the index shows that it contains no wanted message."""
+    """Return whether a chunk's index entry shows that the chunk contains no wanted message."""
     if index is None or index.chunk_length != length or not index.message_index_offsets:
         return False
     return not any(map(wanted, index.message_index_offsets))

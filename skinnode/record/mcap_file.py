@@ -170,7 +170,7 @@ class McapFile:
 
     def discard(self) -> None:
         """Close and delete the file."""
-        with contextlib.suppress(Exception):  # the file may be closed already
+        with contextlib.suppress(Exception):  # the file may already be closed
             self.close()
         discard(self.path)
 

@@ -58,7 +58,7 @@ class McapReader:
         return self._chunks.damaged
 
     def close(self) -> None:
-        """Do nothing because the file is open only while it is being read."""
+        """Do nothing, because the file is open only while it is being read."""
 
     def journal(self) -> Iterator[bytes]:
         """Yield the journal lines."""

@@ -25,8 +25,8 @@ def kept_if_complete(file: _File) -> Iterator[_File]:
     """Yield ``file`` and complete it at the end of the block; delete it if an exception is raised.
 
     Args:
-        file: The file. Its constructor must fail if the file exists, so that a file of another process is
-            never deleted.
+        file: The file. Its constructor must fail if the file exists, so that another process's file is never
+            deleted.
 
     Raises:
         OSError: The rest of the file cannot be written.

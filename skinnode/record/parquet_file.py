@@ -81,7 +81,7 @@ class ParquetFile:
 
     def discard(self) -> None:
         """Close and delete the file."""
-        with suppress(Exception):  # the file may be closed already
+        with suppress(Exception):  # the file may already be closed
             self._writer.close()
         discard(self._path)
 

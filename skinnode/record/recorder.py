@@ -73,7 +73,7 @@ class RecorderStats:
     fields: int = 0
     """Number of fields written; only an MCAP file contains fields."""
     fields_dropped: int = 0
-    """Number of fields not written for the same reasons."""
+    """Number of fields not written, for the same reasons."""
 
 
 class Recorder:
@@ -272,7 +272,7 @@ class Recorder:
         return True
 
     def _write(self, entry: _Entry) -> None:
-        """Write an entry; count its frames and fields that could not be written."""
+        """Write an entry; count any frames and fields that could not be written."""
         before = self._counts()
         self._try(entry.job)
         frames, fields = self._counts()

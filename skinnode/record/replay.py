@@ -178,7 +178,7 @@ class Replay:
     def frames(self) -> Iterator[LoggedFrame]:
         """Yield the frames at the requested speed without decoding them; ``t_ns`` is a monotonic time.
 
-        Iterate either over the fields or over the frames.
+        Iterate over either the fields or the frames.
         """
         pace = _Pace(self._speed, self._wait)
         for logged in self.log:
@@ -237,7 +237,7 @@ class Replay:
         """Return the health of a patch at the current replay time. Raises KeyError for an unknown patch."""
         bus = self._buses[self.hand.patch(patch).bus]
         solver = bus.solver(patch)
-        # on a bus that another master runs, the nodes may have another heartbeat period than in the hand file
+        # on a bus run by another master, the nodes' heartbeat period may differ from that in the hand file
         heartbeat_s = self.hand.bring_up.heartbeat_s if solver is None else solver.facts.heartbeat_s
         health = bus.patches[patch].monitor.health(self._now_ns, heartbeat_s, self.hand.sync.period_s)
         return replace(health, faults=faults_of(self._publisher.latest(patch)))

@@ -1,4 +1,4 @@
-"""Counts the fields that a program has received and lost and measures their age."""
+"""Counts the fields that a program has received and lost, and measures their age."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PatchCounts:
     published: int
     """Number of fields sent in the daemon's current run, as counted by the daemon in its newest report."""
     delay_s: float
-    """Transit time of the newest field, in s; between machines, only as accurate as their clocks."""
+    """Transit time of the newest field, in s; between machines, it is only as accurate as their clocks."""
     age_s: float | None
     """Time since the host received the newest field's scan, in s; None before the first field."""
 

@@ -103,7 +103,7 @@ def encoded(error: Exception) -> bytes:
 
 
 def _decoded(data: bytes, hand: str) -> SkinError | None:
-    """Decode a daemon's error; None for an error of Zenoh itself, such as ``Timeout``."""
+    """Decode a daemon's error; None for an error from Zenoh itself, such as ``Timeout``."""
     try:
         table = json.loads(data)
         kind, text = table["kind"], str(table["text"])

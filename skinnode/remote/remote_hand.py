@@ -34,7 +34,7 @@ SILENT_S: Final = 1.0
 reports per second."""
 _RESET_S: Final = 1.0
 _UNKNOWN: Final = -1
-"""Number of described arrivals that makes the next turn request a new description."""
+"""Number of described arrivals after which the next turn requests a new description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class RemoteHand(RunningHand, Closing):
         """Whether the first health report has arrived.
 
         Raises:
-            SkinError: if the daemon has restarted, and its data are not passed on.
+            SkinError: if the daemon has restarted and its data are not passed on.
         """
         if self._refusal is not None:
             raise self._refusal
@@ -263,8 +263,8 @@ class RemoteHand(RunningHand, Closing):
     def _has_layout(self, patch: str, sent: SendStamp) -> bool:
         """Return whether the layout of a field is known; if it has changed, request it first.
 
-        A node that appears while the daemon runs may supply electrodes other than those described before. A
-        field is not passed on before :meth:`layout` returns its layout.
+        A node that appears while the daemon runs may supply electrodes that differ from those described
+        earlier. A field is not passed on until :meth:`layout` returns its layout.
         """
         if self._hashes[patch] != sent.layout_hash:
             self._ask()

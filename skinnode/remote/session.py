@@ -28,7 +28,7 @@ LOCAL: Final = "127.0.0.1"
 PORT: Final = 17447
 """First port of daemons on this machine. Zenoh's own routers listen on 7447."""
 PORTS: Final = 16
-"""Number of ports, and thus maximum number of daemons, on this machine."""
+"""Number of ports, and thus the maximum number of daemons, on this machine."""
 
 _RETRY: Final = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
 """Pauses between attempts to connect, in ms. A connection on this machine is re-established within 0.2 s."""
@@ -42,8 +42,8 @@ _SETTLE_S: Final = 1.0
 """Time limit for connecting to the router at startup, in s."""
 _SETTLE_LOCAL_S: Final = 5.0
 """Time limit for connecting to the other daemons on this machine at startup, in s. It is reached only if the
-machine is overloaded, or if a port belongs to another kind of program. A daemon that did not connect could
-not see that another daemon already publishes its hand."""
+machine is overloaded, or if a port belongs to another kind of program. A daemon that is not connected cannot
+detect that another daemon already publishes its hand."""
 _ROUTER_MS: Final = 500
 """Time limit for one attempt by a program to connect to a router, in ms."""
 _PAUSE_S: Final = 0.1
@@ -265,6 +265,6 @@ def _refused(options: SessionOptions, error: Exception) -> ConfigError:
 
 
 def _first_line(error: Exception) -> str:
-    """Return the message of a Zenoh error without locations in Zenoh's source code."""
+    """Return the message of a Zenoh error, without the locations in Zenoh's source code."""
     text = re.sub(r" at /\S+?\.rs:\d+\.?", "", " ".join(str(error).split()))
     return text[:200]

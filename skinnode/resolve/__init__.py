@@ -1,4 +1,4 @@
-"""Solves recordings again, with other options or calibrations, in several processes or on a Dask cluster.
+"""Solves recordings again, with different options or calibrations, in several processes or on a Dask cluster.
 
 Data flows in one direction::
 
@@ -12,7 +12,7 @@ needs are finished. There are three kinds of ``units``:
 - ``patch_solver`` solves the scans of one patch with the options of one variant,
 - ``result_file`` writes the fields of all patches to one file, in the order of a replay.
 
-Each patch's stream has state, but the streams do not affect each other. Every unit is therefore independent
+Each patch's stream is stateful, but the streams do not affect each other. Every unit is therefore independent
 and repeatable: its result does not depend on where, when or how often it is run. Each result is a file in the
 work folder (``part_files``), which appears only when it is complete. If the command is repeated, it finds
 these files and continues. A lost worker costs only its current unit. ``identity`` describes the software of a

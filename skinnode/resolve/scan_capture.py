@@ -128,7 +128,7 @@ class _CapturingSolver(ScanSolver):
     """Stands in for a solver: passes scans on and returns empty fields."""
 
     def __init__(self, facts: NodeFacts, keep: Callable[[Scan, ScanStamp, Verdict], None]) -> None:
-        self.facts = facts  # the tracker of ScanSolver is not needed
+        self.facts = facts  # ScanSolver's tracker is not needed
         self._keep = keep
         shape = facts.layout.upper_m.shape
         zero = np.zeros(shape)

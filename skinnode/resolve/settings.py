@@ -64,7 +64,7 @@ def variants(options: Sequence[str]) -> list[Variant]:
 def apply(hand: HandConfig, variant: Variant) -> HandConfig:
     """Return a copy of the hand with the settings of a variant and without a time limit for solving.
 
-    File names become absolute, because a worker may have another working directory.
+    File names become absolute, because a worker may have a different working directory.
 
     Raises:
         ConfigError: A patch or a key does not exist, or a value is not allowed.

@@ -177,7 +177,7 @@ class WriteResult(Unit):
     def run(self, parts: PartFiles) -> None:
         """Write the part, then the file.
 
-        With this order, a file without a part cannot have been written by this unit, even if the process was
+        This order ensures that a file without a part was not written by this unit, even if the process was
         killed.
         """
         with (
@@ -236,7 +236,7 @@ def refused(worker: str, found: str) -> SkinError:
 
 
 def _hashes_of_files(hand: HandConfig) -> list[str]:
-    """Return the hash of each file that the hand names, and whose content affects the result.
+    """Return the hash of each file that is named in the hand and affects the result.
 
     Raises:
         SkinError: A file cannot be read.

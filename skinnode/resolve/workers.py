@@ -30,4 +30,4 @@ class Workers(Protocol):
 
 
 MOST_DEATHS = 3
-"""Number of workers lost while running the same unit after which the unit fails."""
+"""Number of lost workers after which the unit that they were running fails."""

@@ -5,7 +5,7 @@
 touched. ``root_gate`` checks doubtful roots of the exact inverse with the posterior; ``roots`` contains the
 criteria. ``checks`` finds readings that contradict the others, and decides
 whether a field is trusted. ``noise_estimate`` corrects the stated noise if the stream contradicts it.
-``skew`` moves the field of a moving skin to one time, if its wires are sampled one after the other.
+``skew`` converts the field of a moving skin to a single instant if its wires are sampled one after the other.
 ``precision`` compares standard deviations with the user's limits. ``paths`` follows the displacements through
 a recorded press. All of these use ``operators``, ``linalg`` and ``wires``.
 """

@@ -73,8 +73,8 @@ class CodeDecoder:
         """Decode the codes of a frame.
 
         Args:
-            codes: (U, K) codes. If a host passes the read-only array of the last frame again, because the
-                node has sent no new codes, the last result is returned again.
+            codes: (U, K) codes. If a host passes the last frame's read-only array again because the node has
+                sent no new codes, the last result is returned again.
 
         Returns:
             Read-only resistances (U, K) in ohms, NaN where a code is invalid; a read-only mask (U, K) of the

@@ -33,7 +33,7 @@ CUBIC: Final = 0.51
 SPAN: Final = 2.5
 """Difference between the forces on the bonded layer and on the half-space, in reported standard deviations.
 
-With a value of 3, force errors in tests were at most 4.3 standard deviations; 2.5 adds a margin.
+With a value of 3, force errors in tests were at most 4.3 standard deviations; a value of 2.5 adds a margin.
 """
 
 

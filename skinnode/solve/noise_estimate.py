@@ -8,8 +8,8 @@ quadratic  (r₀ − r₁ − r₂ + r₃) / 2
 cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 
 If the stated noise differs between the frames, the variance of a contrast is the sum of the frames'
-variances, weighted with the squares of the coefficients above. The contrasts are then correlated by up to
-0.45, so the standard error of the estimate is up to 10 % larger than assumed.
+variances, weighted by the squares of the coefficients above. The contrasts are then correlated by up to 0.45,
+so the standard error of the estimate is up to 10 % larger than assumed.
 
 A block is rejected if the skin moved. Two tests detect motion:
 
@@ -83,7 +83,7 @@ UNEQUAL: Final = 0.3
 At this limit, motion of the skin raises the noise estimate by 8 %.
 """
 LEAST: Final = 1.0 / 30.0
-"""Lower limit of the noise factor."""
+"""Lower limit on the noise factor."""
 
 _CLIP: Final = 1.0
 """Limit at which Huber's proposal 2 clips squared values, in units of the variance.

@@ -114,7 +114,7 @@ class PosteriorOptions(EstimateOptions):
 
     Args:
         scale_m: RMS normal displacement in the prior, in metres; by default, it is estimated from the data.
-            Not with the prior ``discs``.
+            Cannot be combined with the prior ``discs``.
 
     Raises:
         ValueError: If an option is out of range, or the prior is ``discs`` and ``scale_m`` is given.
@@ -164,7 +164,7 @@ class TrackerOptions(EstimateOptions):
             and to limit the number of false alarms.
         row_time_s: Time between the samples of successive upper wires in a frame, in s; 0 if all upper wires
             are sampled at once. If it is given, the displacements and loads of a moving skin are those at the
-            time at which the first upper wire was sampled (:mod:`skinnode.solve.skew`).
+            time when the first upper wire was sampled (:mod:`skinnode.solve.skew`).
 
     Raises:
         ValueError: If an option is out of range.
@@ -201,7 +201,7 @@ class TrackerOptions(EstimateOptions):
 
     @property
     def nuisances(self) -> list[str]:
-        """Names of all set options that only the posterior supports."""
+        """Names of all options that are set and that only the posterior supports."""
         asked = {
             "drift": self.drift != "none",
             "model_error": self.model_error > 0,

@@ -45,7 +45,7 @@ to 0.028 clearances.
 FORCE_SHARE: Final = 0.3
 """Default limit on a normal force's standard deviation, in units of modulus · clearance · pitch.
 
-In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1. It reached 0.26 in presses of 50 % of
+In the fields described at :data:`MULTIPLE`, this value was at most 0.1. It reached 0.26 in presses of 50 % of
 h that were half outside the patch.
 """
 

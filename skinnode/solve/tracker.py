@@ -15,8 +15,9 @@ crosses the limit for ``exact``. The new method starts at the rest position.
 If the noise is 1e-4 or more, the posterior also uses the readings of earlier frames
 (:mod:`skinnode.solve.posterior.past`), but no readings from before an untouched frame or a gap in the stream.
 
-If the upper wires are sampled one after the other, the field of a moving skin is moved to the time of the
-first wire at the end (:mod:`skinnode.solve.skew`). All solvers and tests work on the fields as solved.
+Finally, if the upper wires are sampled one after the other, the field of a moving skin is moved to the time
+of the first wire (:mod:`skinnode.solve.skew`). All solvers and tests use the fields as solved, before this
+step.
 """
 
 from __future__ import annotations

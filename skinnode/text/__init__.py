@@ -1,1 +1,1 @@
-"""Text output: counted nouns, printable characters, HTML pages and JSON values."""
+"""Text output: numbers with nouns, printable characters, HTML pages and JSON values."""

@@ -1,4 +1,4 @@
-"""Formats counted nouns and unknown values for messages."""
+"""Formats numbers with nouns, and unknown values, for messages."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ each kind only once:
 
 - When a frame is sent, its data is inserted into a packet that python-can has packed for this identifier and
   length.
-- A received packet is compared, without its timestamp and data, with the packets that python-can has already
+- A received packet is compared, ignoring its timestamp and data, with the packets that python-can has already
   unpacked. If the packet differs from all of these or has a different layout, python-can unpacks it.
 
 Like python-can's interface, this interface has no arbitration and does not guarantee delivery or order: it is
@@ -274,7 +274,8 @@ def limit_to_group(sock: socket.socket) -> None:
 def _discard_other_groups(sock: socket.socket) -> None:
     """Discard packets received before reception was limited to one multicast group.
 
-    If there were any, discard again after a pause, because the kernel may still be delivering packets.
+    If there were any, discard packets again after a pause, because the kernel may still be delivering
+    packets.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)

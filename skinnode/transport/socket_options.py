@@ -28,7 +28,7 @@ def enlarge_receive_buffer(sock: socket.socket) -> None:
 
 @contextlib.contextmanager
 def socket_of(fileno: int) -> Iterator[socket.socket]:
-    """Yield a socket for a file descriptor, which stays open after the ``with`` block."""
+    """Yield a socket for a file descriptor; the descriptor stays open after the ``with`` block."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         yield duplicate

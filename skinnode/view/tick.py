@@ -34,7 +34,7 @@ class Tick:
 
 
 class SuppliedPositions:
-    """Electrode positions that have been passed on, so that each is passed on only once.
+    """Record of the electrode positions already passed on, so that each is passed on only once.
 
     Args:
         hand: The hand.

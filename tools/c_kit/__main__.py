@@ -39,7 +39,7 @@ STEPS = tuple(step for steps in HALVES.values() for step in steps)
 
 
 def measure(profile: PatchProfile) -> dict[str, str]:
-    """Return the column of the table for a profile, by row title."""
+    """Return a profile's column of the table, keyed by row title."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in kit_files(profile).items():

@@ -8,7 +8,7 @@ replayed recordings, and generated files such as EDS files.
 The results are divided into parts. For each part, the report lists the hash of each commit's results, and the
 largest relative difference in each array that differs.
 
-The exit status is 0 if float arrays agree to within ``--rtol``, by default exactly, and all other arrays are
+The exit status is 0 if float arrays agree to within ``--rtol`` (by default, exactly) and all other arrays are
 equal; otherwise, it is 1.
 """
 

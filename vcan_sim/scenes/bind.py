@@ -108,7 +108,7 @@ def _history(  # noqa: PLR0913 - all inputs of a touch
     layer: Layer,
     layout: PatchLayout,
 ) -> History:
-    """Return the history of a touch; cached, because a program's tests start the same scene many times."""
+    """Return the history of a touch, cached because a program's tests start the same scene many times."""
     places = np.ascontiguousarray(layout.upper_m[..., :2].reshape(-1, 2))
     electrodes = Electrodes.of(layer, places, float(np.median(layout.upper_m[..., 2])))
     return History(touch, body.shape, friction, window, step_s, electrodes)

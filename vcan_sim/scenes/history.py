@@ -1,7 +1,8 @@
 """Contact mechanics of one touch at fixed time steps.
 
 Friction depends on history, so the time steps are computed in order and stored. The cells belong to a lattice
-that is fixed to the patch. The window follows the body in whole cells, so tractions are never interpolated.
+that is fixed to the patch. The window follows the body in whole-cell steps, so tractions are never
+interpolated.
 """
 
 from __future__ import annotations
@@ -150,7 +151,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Move the window with the body, in whole cells. The tractions stay in place on the skin."""
+        """Move the window with the body, in whole-cell steps. The tractions stay in place on the skin."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))

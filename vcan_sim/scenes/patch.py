@@ -92,7 +92,7 @@ class PatchScene:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield each touch that is in contact around ``t_s``, and its weighted time steps."""
+        """Yield each touch in contact around ``t_s``, with its weighted time steps."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)

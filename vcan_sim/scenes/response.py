@@ -15,8 +15,8 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Maximum range of the table of displacement versus distance, as a multiple of the layer thickness.
-Beyond it, the displacement is below ``FAR``."""
+"""Maximum range of the displacement-versus-distance table, as a multiple of the layer thickness. Beyond it,
+the displacement is below ``FAR``."""
 CLUSTER_CELLS: Final = 6.0
 """Distance from the window, in cells, beyond which each block of 2 × 2 cells acts as one point force."""
 FAR: Final = 1e-5

@@ -78,7 +78,7 @@ def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m
 
 
 def centred_m(grid: Grid) -> Float:
-    """Return the centre (2,) of the first cell of a grid relative to the middle of the grid, in metres."""
+    """Return the centre (2,) of a grid's first cell relative to the middle of the grid, in metres."""
     return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
 
 
@@ -167,7 +167,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # the remaining error is within the contact solver's
+        if high - low < 0.1 * close * high:  # the remaining error is no larger than the contact solver's own
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:

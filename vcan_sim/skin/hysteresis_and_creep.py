@@ -1,6 +1,6 @@
 """Hysteresis and creep of the rubber, which make the displacement depend on earlier loads.
 
-Hysteresis and then creep act on each coordinate of the displacement of each electrode:
+Hysteresis, and then creep, acts on each coordinate of each electrode's displacement:
 
 hysteresis   The fraction w of the displacement passes through parallel play operators. Each operator follows
              its input s only outside a band of ±r: p ← max(s − r, min(s + r, p)), with p = 0 initially. The

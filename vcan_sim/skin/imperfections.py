@@ -76,7 +76,7 @@ class Imperfections:
     """Rise of the upper layer from the middle of the patch to its edge, along x and along y, as a fraction of
     the clearance between the layers; drawn."""
     electrode_radius: float = 0.0
-    """Radius in pitches of the electrodes, which are conducting discs parallel to the x-y plane."""
+    """Radius of the electrodes, in pitches; they are conducting discs parallel to the x-y plane."""
 
     # --- rubber
     strain: float = 0.0

@@ -19,10 +19,10 @@ MAX_DATA_BPS: Final = 8_000_000
 class BitRates:
     """Bit rates of a bus.
 
-    Time is counted in ticks. A nanosecond, a nominal bit time and a data bit time are all whole multiples of
-    a tick, which is the longest unit with this property; it is 1 ns if both bit times are whole nanoseconds.
-    Times in ticks are exact. Only the times reported to callers are rounded, each separately, so rounding
-    errors do not accumulate.
+    Time is counted in ticks. A tick is the longest unit of which a nanosecond, a nominal bit time and a data
+    bit time are all whole multiples; it is 1 ns if both bit times are whole numbers of nanoseconds. Times in
+    ticks are exact. Only the times reported to callers are rounded, each separately, so rounding errors do
+    not accumulate.
 
     Raises:
         ConfigError: If a bit rate is out of range.

@@ -283,7 +283,7 @@ class TimedBus:
 
     @property
     def frames(self) -> Mapping[tuple[int, bool], int]:
-        """Numbers of delivered frames, keyed by identifier and whether the identifier is extended."""
+        """Number of delivered frames, keyed by the identifier and by whether it is extended."""
         return MappingProxyType(self._frames)
 
     def busy_share(self, from_ns: int, to_ns: int) -> float:

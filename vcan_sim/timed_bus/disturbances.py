@@ -92,7 +92,7 @@ class Attempt(NamedTuple):
 
     frame: CanFrame
     n_bits: Callable[[], int]
-    """Function that returns the number of bits in the frame that can be disturbed."""
+    """Function that returns how many bits of the frame can be disturbed."""
     bit_at: Callable[[int], int | None]
     """Function that returns the position of the bit sent at a given time (ns); None outside the frame."""
 

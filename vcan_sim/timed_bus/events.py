@@ -1,4 +1,4 @@
-"""Events on a simulated bus. Times are whole nanoseconds, rounded up from the exact time."""
+"""Events on a simulated bus. Times are in whole nanoseconds, rounded up from the exact time."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ class WireFrame:
     bits: tuple[int, ...]
     """Bits from the start of frame to the last bit of the end of frame."""
     stuffed_end: int
-    """Number of bits subject to the stuff rule, including stuff bits. These bits end with the CRC sequence,
-    or with the data in CAN FD."""
+    """Number of bits subject to the stuff rule, including stuff bits. These bits end with the CRC sequence;
+    in CAN FD, they end with the data."""
     plain: int
     """Number of bits subject to the stuff rule, excluding stuff bits."""
     fixed_stuff: tuple[int, ...]

@@ -20,7 +20,7 @@ SIZES: Final = {method: 55 if "past" in method else 140 for method in METHODS}
 """Size of each method's mark: if earlier frames change nothing, both marks of a prior remain visible."""
 TITLES: Final = {"held": "body held still", "moving": "body moving"}
 ASKED: Final = (0.92, 0.98)
-"""Range of the coverage that is shaded."""
+"""Coverage range that is shaded."""
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:

@@ -93,7 +93,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
-    """Yield one line for each property of an entry that is allowed but that some tools do not support."""
+    """Yield one line for each entry property that is allowed but not supported by some tools."""
     if entry.mappable and not entry.size and entry.data_type in _TEXTS and entry.data_type != _DOMAIN:
         yield f"{entry}: mappable, but of variable length"
     if entry.low is not None and entry.high is not None and entry.low > entry.high:

@@ -30,7 +30,7 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Check that heartbeats, and no other error-control frames, arrive with the configured period.
+    """Check that heartbeats, and no other error-control frames, arrive at the configured period.
 
     If ``remote`` is set, a guarding request is sent after each heartbeat.
     """

@@ -30,7 +30,7 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Time to wait for the first TPDO of a cycle after each SYNC, before sending the next SYNC, in s."""
+"""Time to wait after each SYNC for the first TPDO of a cycle before sending the next SYNC, in s."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 

@@ -24,7 +24,7 @@ TOO_LOW = (0x0609_0030, 0x0609_0032)
 
 _DEVICE_TYPE = 0x1000
 _HARMLESS = (HEARTBEAT, 0x1015, 0x1006, 0x1007, GUARD_TIME)
-"""CiA 301 objects that accept any value without an immediate effect."""
+"""CiA 301 objects to which any value can be written without an immediate effect."""
 _SPECIAL = (0x1003, 0x1010, 0x1011, 0x1020, 0x1F50, 0x1F51)
 """Objects that accept only commands or certain values."""
 _STRINGS = (0x1008, 0x1009, 0x100A)
@@ -118,7 +118,7 @@ def no_object(dut: Dut) -> None:
 def unknown_command(dut: Dut) -> None:
     what = "command specifier 7"
     answer = dut.sdo.ask(b"\xe0" + mux(_DEVICE_TYPE, 0), what)
-    # The standard does not specify the multiplexer of this abort.
+    # The standard does not specify the multiplexer for this abort.
     index, subindex = struct.unpack("<HB", answer[1:4])
     dut.sdo.check_abort(answer, index, subindex, UNKNOWN_COMMAND, what)
     dut.sdo.read(_DEVICE_TYPE)

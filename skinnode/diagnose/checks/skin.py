@@ -178,7 +178,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is much noisier than its neighbours; a touch would affect these too."""
+    """Return whether a wire is much noisier than its neighbours; a touch would affect the neighbours too."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
@@ -282,7 +282,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
 
 
 def is_touched(scans: ScanFacts) -> bool:
-    """Return whether something touched the skin during the scans; some checks are then skipped."""
+    """Return whether something touched the skin during the scans; if so, some checks are skipped."""
     return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
 
 

@@ -11,7 +11,7 @@ from skinnode.diagnose.facts import BusFacts, Finding, Sure
 from skinnode.text.words import counted
 
 _JITTER: Final = 0.1
-"""SYNC jitter above which SYNC is reported as irregular, as a fraction of the period."""
+"""SYNC jitter, as a fraction of the period, above which SYNC is reported as irregular."""
 
 _PERIOD_ERROR: Final = 0.02
 _LATE: Final = 0.95

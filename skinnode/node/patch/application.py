@@ -119,7 +119,7 @@ class PatchApplication:
     def reset(self, *, everything: bool) -> None:
         """Restart the scan counter. Persistent faults are reported again.
 
-        If ``everything`` is true, forget the result of the self-test, too.
+        If ``everything`` is true, also forget the result of the self-test.
         """
         self._counter, self._late = -1, False
         self._wire_faults.reset()

@@ -84,7 +84,7 @@ def bind_baseline(
 
 
 def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
-    """Return, for each sub-index, its slice of the record's concatenated bytes.
+    """Return each sub-index's slice of the record's concatenated bytes.
 
     Args:
         store: Object dictionary.

@@ -3,9 +3,9 @@
 Chunks are sent in the first TPDO whose first mapped object is 0x2010 and that is event-driven or due at the
 SYNC that starts the scan. The summary is sent in every TPDO whose first mapped object is 0x2011. If such a
 TPDO is event-driven, or was due at the SYNC that started the scan, it immediately follows the chunks.
-Otherwise, it is sent at the next SYNC at which it is due, unless that SYNC starts a scan and the summary
-belongs to a scan that an earlier SYNC started: then only the summary of the new scan is sent. The end of a
-scan also triggers all event-driven TPDOs that contain other objects.
+Otherwise, it is sent at the next SYNC at which it is due. If that SYNC starts a scan and the summary belongs
+to a scan that an earlier SYNC started, only the summary of the new scan is sent. The end of a scan also
+triggers all event-driven TPDOs that contain other objects.
 
 **Pacing.** CiA 301 defines the inhibit time as a minimum interval between frames. Under a general-purpose
 operating system, threads can wake up late, so with a strict minimum interval, a scan could take longer than
@@ -26,7 +26,7 @@ the summary states that chunks are missing.
 
 **Lost frames.** If a chunk or a summary cannot be sent, receivers no longer know the codes of unsent chunks,
 so the next scan must be a full scan. This does not apply to chunks that are discarded at the end of the
-synchronous window: in a full scan, there would be more of them.
+synchronous window: in a full scan, even more chunks would be discarded.
 """
 
 from __future__ import annotations
@@ -155,8 +155,8 @@ class ScanStream:
     def on_sync(self, turns: frozenset[int], t_ns: int, *, starts_scan: bool) -> None:
         """Send the waiting summaries that are due at a SYNC.
 
-        If the SYNC starts a scan, only the summary of a scan that no SYNC started is sent. If that scan is
-        still being sent, its summary follows its chunks.
+        If the SYNC starts a scan, only the summary of a scan that was not started by a SYNC is sent. If that
+        scan is still being sent, its summary follows its chunks.
 
         Args:
             turns: Numbers of the synchronous TPDOs that are due.

@@ -25,8 +25,8 @@ The relative standard error of the noise estimate is 1/√30 = 18 % for one cros
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Maximum relative noise of a reading that passes the self-test. The accuracy of the solver is specified for
-one hundredth of this noise."""
+"""Maximum relative noise of a reading that passes the self-test. The solver's accuracy is specified for one
+hundredth of this noise."""
 
 
 @np.errstate(over="ignore", invalid="ignore")  # only absurdly large resistances overflow

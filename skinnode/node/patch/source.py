@@ -13,9 +13,9 @@ class ResistanceSource(Protocol):
     """Source of the resistances between the upper and the lower wires of a patch.
 
     A source can also have an integer attribute ``conversions``: the number of times that the converter has
-    measured all crossings. The node reads it after calling :meth:`read` and states in the summary whether it
-    has changed. The host can then detect a stopped converter immediately. If the attribute is missing or
-    None, the host must rely on the codes to detect a stopped converter.
+    measured all crossings. The node reads this attribute after calling :meth:`read` and indicates in the
+    summary whether its value has changed. The host can then detect a stopped converter immediately. If the
+    attribute is missing or None, the host must rely on the codes to detect a stopped converter.
 
     The conversions must be counted by the converter itself, not by :meth:`read`, and the converter must
     measure all crossings at least once per scan. Otherwise, the source must not have this attribute.
@@ -34,7 +34,7 @@ class ResistanceSource(Protocol):
 
 
 def conversions_of(source: ResistanceSource) -> int | None:
-    """Return the number of conversions of a source, or None if the source does not count them.
+    """Return a source's conversion count, or None if the source does not count conversions.
 
     Raises:
         SourceFailed: If the attribute raises an exception or is not an integer.

@@ -32,7 +32,7 @@ class WireFaults:
 
     @staticmethod
     def none(profile: PatchProfile) -> WireFaults:
-        """Return a WireFaults object without faults."""
+        """Return a fault-free WireFaults object."""
         return _no_faults((profile.rows, profile.columns))
 
     @property
@@ -48,7 +48,7 @@ class WireFaults:
 
 @functools.cache
 def _no_faults(shape: tuple[int, int]) -> WireFaults:
-    """Return a WireFaults object without faults for U upper and K lower wires. Its arrays are read-only."""
+    """Return a fault-free WireFaults object for U upper and K lower wires. Its arrays are read-only."""
     upper, lower = (np.zeros(wires, dtype=np.bool_) for wires in shape)
     for mask in (upper, lower):
         mask.flags.writeable = False
@@ -88,8 +88,7 @@ class WireFaultReporter:
         """Report new wire faults, or the end of all wire faults.
 
         Faults that begin in the same scan, for example when a connector is unplugged, are reported in one
-        message, which contains the type and wire number of the first new fault, and the number of faulty
-        wires.
+        message that contains the type and wire number of the first new fault and the number of faulty wires.
 
         Args:
             faults: Current wire faults.

@@ -76,7 +76,7 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Communication and mapping parameters of a PDO. A time of 0 ns disables the respective timer."""
+    """Communication and mapping parameters of a PDO. A time of 0 ns disables the corresponding timer."""
 
     enabled: bool
     """Whether the PDO is enabled and has at least one mapped object."""

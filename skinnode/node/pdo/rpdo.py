@@ -175,8 +175,8 @@ class RpdoEngine:
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
         """Write the mapped objects. Refused values are ignored, because a PDO has no response.
 
-        An object may cause a frame that the bus refuses, such as the first chunk of a single scan. The other
-        objects are written nevertheless; then the error is raised.
+        Writing an object may trigger a frame that the bus refuses, such as the first chunk of a single scan.
+        The other objects are still written before the error is raised.
         """
         failure: BusError | None = None
         for index, subindex, start, end in rpdo.fields:

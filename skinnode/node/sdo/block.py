@@ -55,7 +55,7 @@ class _Client(IntEnum):
 
 
 class _Upload(Enum):
-    """Event for which a block upload is waiting."""
+    """Event that a block upload is waiting for."""
 
     START = auto()
     TIME = auto()

@@ -53,15 +53,15 @@ CROSSED_FRAMES: Final = 5
 within this time, both wires are reported."""
 RELINEARISED: Final = 50.0
 """Gain in log evidence from assuming one wrong reading, in nats, above which a frame that loads seem to
-explain is linearised again, about the field without that reading. A field computed from a grossly wrong
-reading can be so far off that the linearised readings of its whole wire appear to be caused by loads. The
-gain was at most 37 nats in 3,000 healthy frames (``bench trust --seed 1``); in longer streams, a few narrow
-presses exceed the limit."""
+explain is linearised again about the field computed without that reading. A field computed from a grossly
+wrong reading can be so far off that the linearised readings of its whole wire appear to be caused by loads.
+The gain was at most 37 nats in 3,000 healthy frames (``bench trust --seed 1``); in longer streams, a few
+narrow presses exceed the limit."""
 RELINEARISED_MARGIN: Final = 200.0
-"""Minimum margin, in nats, for a fault that is found by linearising about the field without the suspected
-reading. Without the reading, a narrow load is smoothed: in 1.2 million healthy frames at noise 1e-5, the
-margin reached 91 nats in six frames; for grossly wrong readings, it was 480 to 6,042 nats
-(``bench trust --seed 1``)."""
+"""Minimum margin, in nats, for a fault found by linearising about the field without the suspected reading.
+Without the reading, a narrow load is smoothed: in 1.2 million healthy frames at noise 1e-5, the margin
+reached 91 nats in six frames; for grossly wrong readings, it was 480 to 6,042 nats (``bench trust --seed
+1``)."""
 UNRESOLVED_FRAMES: Final = 10
 """Number of frames after an unexplained contradiction during which a gain above :data:`RELINEARISED` makes a
 frame doubtful, even if loads seem to explain it."""
@@ -328,7 +328,7 @@ class DataCheck:
         """Return the groups of readings whose changes since the last field contradict the other changes.
 
         Crossed wires are not reported, because they would have been found in the changes since rest; the
-        frame is then doubtful.
+        frame is considered doubtful instead.
         """
         gains = self._unusual_change(solved)
         if gains is None or not self._may_examine(gains, until):

@@ -38,11 +38,11 @@ class ExaminationTime:
         self._waiting = 0
 
     def insist(self) -> None:
-        """Force the examination of the next suspicious frame, even if there is no time."""
+        """Force the next suspicious frame to be examined, even if there is no time."""
         self._waiting = PATIENCE
 
     def allows(self, until: float, seconds: float | None = None) -> bool:
-        """Return whether a step in the examination of a suspicious frame may start.
+        """Return whether a step in examining a suspicious frame may start.
 
         The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would miss it.
 
@@ -59,7 +59,7 @@ class ExaminationTime:
         return self.is_overdue
 
     def is_in_time(self, until: float, seconds: float | None = None) -> bool:
-        """Return whether a step of ``seconds`` would end by ``until``, or the frame is overdue."""
+        """Return whether a step of ``seconds`` would end by ``until``, or whether the frame is overdue."""
         seconds = self.expected_s if seconds is None else seconds
         return self.is_overdue or perf_counter() + seconds <= until
 

@@ -4,9 +4,9 @@ A frame can be unlikely under the elastic prior for three reasons: some readings
 crossed, or the loads are unusual, such as a contact much narrower than the patch. A greedy search, similar to
 orthogonal matching pursuit, builds an explanation step by step. Each step adds the load or the group of wrong
 readings with the largest gain in log evidence. An explanation with faults is accepted only if its log
-evidence exceeds the log evidence of the best explanation without faults by more than :data:`MARGIN`. The same
-margin applies to crossed wires. Their log evidence is computed for loads alone, after the readings of the two
-wires have been exchanged.
+evidence exceeds that of the best explanation without faults by more than :data:`MARGIN`. The same margin
+applies to crossed wires. Their log evidence is computed for loads alone, after the readings of the two wires
+have been exchanged.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least
 
 MARGIN: Final = 40.0
 """Minimum margin for reporting a fault, in nats. The margin is the log evidence with faults minus the log
-evidence of loads alone. In 1.9 million healthy frames, the margin reached 29 nats in presses on the border of
-a patch (``bench trust --seed 1 --only hours``)."""
+evidence of loads alone. Over 1.9 million healthy frames, the margin reached 29 nats, in presses on the border
+of a patch (``bench trust --seed 1 --only hours``)."""
 MARGIN_OF_WIRE: Final = 20.0
 """Minimum margin for reporting a wire that contradicts the others, in nats. At this value, no faults were
-reported in 6,800 healthy frames of deep slides (noise 3e-6), nor in 270 frames with six kinds of presses
-(noise 1e-5). A smaller margin does not make a frame doubtful."""
+reported in 6,800 healthy frames of deep slides (noise 3e-6), or in 270 frames with six kinds of press (noise
+1e-5). A smaller margin does not make a frame doubtful."""
 MARGIN_OF_READING: Final = 100.0
-"""Minimum margin for reporting a single wrong reading, in nats. In 1.2 million healthy frames at noise 1e-5,
-the margin reached 77 and 87 nats in two presses (``bench trust --seed 1 --only hours --hours 10``)."""
+"""Minimum margin for reporting a single wrong reading, in nats. Over 1.2 million healthy frames at a noise of
+1e-5, the margin reached 77 and 87 nats, in two presses (``bench trust --seed 1 --only hours --hours 10``)."""
 DOUBT: Final = 5.0
 """Minimum margin at which a frame is considered doubtful, in nats. In 144 healthy frames, the margin over
-explanations by up to 8 loads was never positive."""
+explanations with up to 8 loads was never positive."""
 CLEAR: Final = -30.0
 """Margin, in nats, below which loads or noise clearly explain a frame. Lower margins need not be computed."""
 SCALES: Final = 4
 """Number of prior scales searched for explanations: the best-fitting scale and smaller ones. A wrong reading
-can inflate the best-fitting scale by a factor of up to 2⁴, a narrow contact by up to 2³."""
+can inflate the best-fitting scale by a factor of up to 2⁴, and a narrow contact by a factor of up to 2³."""
 STRIDE: Final = 2
 """Step in log2 κ between the prior scales that are searched."""
 HOPELESS: Final = 150.0
@@ -190,9 +190,9 @@ class Explainer:
     ) -> tuple[float, int]:
         """Return the highest log evidence for loads and one wrong reading, and the index of this reading.
 
-        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
-        A single reading needs its own search. At small prior scales, the greedy search would first leave out
-        the whole wire of this reading.
+        A log evidence that does not exceed ``needed`` is not computed; −inf is returned instead. A single
+        reading needs its own search. At small prior scales, the greedy search would first leave out the whole
+        wire of this reading.
         """
         alphas = np.ascontiguousarray(products[:, : z.size])
         gain, number = crossing_gain(self._model.diagonals[best], alphas[0], present.ravel(), cost)
@@ -218,7 +218,7 @@ class Explainer:
     ) -> tuple[float, WirePair]:
         """Return the highest log evidence for loads and two exchanged wires, and these wires.
 
-        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
+        A log evidence that does not exceed ``needed`` is not computed; −inf is returned instead.
         """
         gain, pair = likeliest(level.precision, alpha, z, present, far=True, enough=DOUBT)
         if gain <= DOUBT:
@@ -240,7 +240,7 @@ class Explainer:
     ) -> float:
         """Return the highest log evidence for loads and a fault of the wire in ``finding``.
 
-        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
+        A log evidence that does not exceed ``needed`` is not computed; −inf is returned instead.
         """
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
@@ -276,13 +276,13 @@ class Explainer:
     ) -> float:
         """Return the highest log evidence for loads alone, with ``extra`` added at each κ.
 
-        The log evidence is computed only where it exceeds ``needed``; otherwise, −inf is returned.
+        A log evidence that does not exceed ``needed`` is not computed; −inf is returned instead.
         """
         model = self._model
         evidence, scratch = np.empty(len(model.kappa)), np.empty((2, z.size))
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
         starts = {number: float(evidence[number]) + extra(model.level(number)) for number in _scales(best)}
-        half_chi2 = -evidence - 0.5 * model.log_det  # no loads can gain more
+        half_chi2 = -evidence - 0.5 * model.log_det  # loads can gain no more than this
         hopeful = [number for number in starts if starts[number] + half_chi2[number] >= needed]
         if not hopeful:
             return -math.inf

@@ -27,8 +27,8 @@ ADMIT: Final = 64
 """Number of consecutive frames in which the readings of a confirmed fault must agree with the field before
 they are used again. The number doubles each time the fault returns, up to :data:`MOST_ADMIT`. Not tuned."""
 MOST_ADMIT: Final = 4096
-"""Maximum of this number. Without it, the readings of a loose contact would not be used again for hours after
-the repair."""
+"""Maximum of this number. Without this limit, the readings of a loose contact would stay unused for hours
+after its repair."""
 AGREE: Final = 3.0
 """Maximum RMS deviation of readings that agree with a field, in standard deviations."""
 
@@ -83,8 +83,8 @@ class FaultList:
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
         """Record the groups of wrong readings in a frame and return the faults that are not yet confirmed.
 
-        Crossed wires are reported only after confirmation: they stay crossed, whereas a press that one wire
-        does not show yet can resemble crossed wires for one frame.
+        Crossed wires are reported only after confirmation: real ones stay crossed, whereas a press that does
+        not yet show in one wire can resemble crossed wires for one frame.
 
         Args:
             groups: Groups of wrong readings.

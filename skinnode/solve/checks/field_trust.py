@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 def assess(
     status: Sequence[Status], used: Mask, faults: Sequence[DataFault], *, contradiction: str
 ) -> tuple[str, Mask]:
-    """Return the reason why a field is not trusted, and a mask of its trusted upper wires.
+    """Return why a field is not trusted, and a mask of its trusted upper wires.
 
     Args:
         status: (U,) statuses of the upper wires.

@@ -4,8 +4,8 @@ The search is a form of batch orthogonal matching pursuit. Its dictionary is A =
 each of the m readings and one for the readings' response to each of the 4Q loads. The search needs Aᵀ P z and
 the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a reading is a rank-one update of the
 precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it updates Aᵀ
-P z and the diagonal. Only each wire's block of P' itself is computed; the blocks are needed to test whether
-all readings of a wire are wrong.
+P z and the diagonal. Of P' itself, only each wire's block is computed; these blocks are needed to test
+whether all readings of a wire are wrong.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ loads each. With a maximum of 8, half of the healthy frames of a deep slide were
 ENOUGH: Final = 1.0
 """Minimum gain in log evidence (nats) for adding a load or a group of wrong readings."""
 ROUNDING: Final = 1e-6
-"""Margin for rounding errors in the bounds of gains, in nats."""
+"""Margin for rounding errors in the bounds on the gains, in nats."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
 """Kinds of search steps: add a load; leave out one reading; leave out all readings of a lower wire, or of an
 upper wire."""
@@ -124,7 +124,7 @@ class GreedySearch:
         )  # fmt: skip
 
     def _slack(self, number: int, cost: float, faults: bool) -> float:
-        """Return an upper bound of ½ ln det S_GG − cost · |G| over all sets G of readings; 0 without faults.
+        """Return an upper bound on ½ ln det S_GG − cost · |G| over all sets G of readings; 0 without faults.
 
         All principal minors of S e^(−2 cost) are at most det(I + S e^(−2 cost)).
         """
@@ -182,7 +182,7 @@ def _group_gain(  # noqa: PLR0913 - a kernel: arrays by name
 def _update_block(  # noqa: PLR0913 - a kernel: arrays by name
     block: Float, first: int, step: int, vectors: Float, share: Float, done: int, count: int
 ) -> None:
-    """Apply the updates ``done`` to ``count`` to the block of the readings ``first``, ``first + step``, ….
+    """Bring the block of the readings ``first``, ``first + step``, … from ``done`` updates to ``count``.
 
     The updates are those of P, with the search vectors and their shares.
     """
@@ -220,8 +220,8 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
     is the number of groups of its kind. Groups whose gain cannot exceed ``enough`` may be ignored. The gain
     of a wire is at most ``bound`` plus its element of ``log_det_s`` (U + K,) minus the costs. While all
     readings are in use, it is also at most ``bound`` minus its element of ``log_det_p`` minus the costs.
-    A wire's block of P is updated only when it is needed: ``applied`` (U + K,) is the number of updates, of
-    ``count`` in ``vectors`` and ``share``, that it contains. ``block`` and ``right`` are work arrays.
+    A wire's block of P is updated only when it is needed: of the ``count`` updates in ``vectors`` and
+    ``share``, each block already contains ``applied`` (U + K,). ``block`` and ``right`` are work arrays.
     """
     upper, lower = len(of_upper), len(of_lower)
     complete = True
@@ -415,7 +415,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
 ) -> float:
     """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain in nats.
 
-    Bounds of the gains: the gain of a load, ½ (r − 1 − ln r), reduces ½ χ² = ½ zᵀ P z by ½ (r − 1) and
+    Bounds on the gains: the gain of a load, ½ (r − 1 − ln r), reduces ½ χ² = ½ zᵀ P z by ½ (r − 1) and
     multiplies the determinants of all blocks of S by at most r. The gain of a group G of wrong readings
     reduces ½ χ² by ½ α_Gᵀ P_GG⁻¹ α_G; the rest of it is −½ ln det P_GG ≤ ½ ln det S_GG minus the costs. The
     gain of all further steps is therefore at most the remaining ½ χ² (``left``), and with faults at most

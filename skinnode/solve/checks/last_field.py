@@ -2,8 +2,8 @@
 
 The exact inverse has no redundancy: if one reading of a wire changes, some displacement of the wire explains
 it. Under a press, the elastic prior allows large displacements, so it does not reveal a reading that is wrong
-by 20 to 100 times the noise. From one frame to the next, the load changes much less than since rest. The
-change of the field therefore has a much smaller prior scale, at which the same error stands out.
+by 20 to 100 times the noise. From one frame to the next, the load changes much less than it has changed since
+rest. The change in the field therefore has a much smaller prior scale, at which the same error stands out.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class LastField:
         self._frame = frame
 
     def change(self, field: FieldFrame, frame: int) -> Float | None:
-        """Return the change (U, 3N) of the displacements since the stored field, in metres.
+        """Return the change (U, 3N) in the displacements since the stored field, in metres.
 
         The array is overwritten by the next call. Returns None if no field is stored, or if it is older than
         :data:`AGE` frames.

@@ -31,7 +31,7 @@ WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Values of κ at which single readings are tested, in steps below the best-fitting value."""
+"""Values of κ at which single readings are tested, in steps down from the best-fitting value."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of actual to stated noise that the check tries as explanations of a suspicious frame."""
 COARSE: Final = 0.1
@@ -122,9 +122,9 @@ class LinearisedReadings:
         return math.log(max(WRONG / self.sigma, math.e))
 
     def set_complete(self, solved: Solved) -> None:
-        """Compute the changes since rest of a frame that the exact inverse solved with all readings.
+        """Compute the changes since rest in a frame that the exact inverse solved with all readings.
 
-        The result is that of :meth:`set_frame`, in less time.
+        The result is the same as that of :meth:`set_frame`, but takes less time to compute.
         """
         if self._drift != "none":
             self.set_frame(solved, self._all)
@@ -151,7 +151,7 @@ class LinearisedReadings:
         self._fit()
 
     def set_frame(self, solved: Solved, present: Mask) -> None:
-        """Compute the changes of a frame since rest, linearised about its field."""
+        """Compute the changes in a frame since rest, linearised about its field."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m

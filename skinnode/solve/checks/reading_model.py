@@ -30,7 +30,7 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior, bonded_r
 
 USUAL: Final = (-25, -3)
 """Range of log2 s for which load tables are computed in advance, where s is the prior scale in pitches. The
-search for explanations of slight touches in low noise uses the smallest scales."""
+smallest scales are used in the search for explanations of light touches at low noise."""
 MOST_USUAL: Final = 9
 """Number of prior scales prepared for a large patch: the largest scales in :data:`USUAL`."""
 STORED: Final = 180_000_000

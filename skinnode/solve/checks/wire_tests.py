@@ -1,9 +1,9 @@
 """Tests whole wires for gain errors and for readings that are inconsistent with the other wires.
 
 If the readings of a wire are delayed or belong to another wire, each individual reading may agree with the
-others within its uncertainty. Only a test of all readings of the wire together then detects the fault. Let G
-be the readings of a wire, P the precision of all readings, S = P⁻¹ their covariance, and α = P z. The tests
-compare two hypotheses with the hypothesis of a healthy wire:
+others within its uncertainty. Only a joint test of all the wire's readings then detects the fault. Let G be
+the readings of a wire, P the precision of all readings, S = P⁻¹ their covariance, and α = P z. The tests
+compare two hypotheses with that of a healthy wire:
 
 - Unrelated: z_G is independent of the other wires, with the distribution N(0, S_GG). The log evidence changes
   by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG.
@@ -81,7 +81,7 @@ class WireTables:
 
 
 def wire_blocks(matrix: Float, shape: tuple[int, int]) -> tuple[Float, Float]:
-    """Return the blocks of each wire in a matrix (m, m) of the readings, as writable views.
+    """Return writable views of each wire's block in an (m, m) matrix of the readings.
 
     Args:
         matrix: (m, m) C-ordered matrix, m = U K.

@@ -48,7 +48,7 @@ class Growth:
     """Standard deviation of the patch's steady drift after one hour, divided by the noise."""
 
     def after(self, seconds: float) -> tuple[float, float]:
-        """Return the growth of a wire's variance and of the patch's variance over ``seconds`` seconds."""
+        """Return the growth in variance of a wire's gain and of the patch's gain over ``seconds`` s."""
         hours, steady_h = seconds / 3600.0, max(seconds - MEASURED_S, 0.0) / 3600.0
         return (
             hours * self.drift**2 + (steady_h * self.steady) ** 2,

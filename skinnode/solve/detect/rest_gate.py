@@ -3,7 +3,7 @@
 The field of an untouched patch is zero. Its standard deviations, statuses and trust are taken from the last
 solved frame that was untouched, converged and trusted, with the same usable readings and the same noise. The
 gate opens for every frame that is touched or doubtful, or contains an unusual reading or wire, so that the
-data check examines it. The gate stays open while readings are left out because of a fault.
+data check can examine it. The gate stays open while readings are left out because of a fault.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from skinnode.solve.wires.problem import PatchProblem
 NOISIER: Final = 1.25
 """Factor by which a frame's noise must differ from the detector's for the detector to adopt it."""
 NOISIER_FRAMES: Final = 4
-"""Number of successive frames with more noise than the detector assumes after which it adopts their noise.
-Until then, their readings have less weight. The detector adopts less noise immediately. If it also adopted
-more noise immediately, it would discard its last frames at each change, and a touch would never end if the
-noise alternates."""
+"""Number of successive frames, noisier than the detector assumes, after which it adopts their noise. Until
+then, their readings have less weight. The detector adopts lower noise immediately. If it also adopted higher
+noise immediately, it would discard its last frames at each change, and a touch would never end if the noise
+alternated."""
 GAP_S: Final = 2.0
 """Interval between two frames, in s, above which the detector counts the missing frames. Over a shorter
 interval, the drift is negligible."""
@@ -187,7 +187,7 @@ class RestGate:
         return self._used is not None and np.array_equal(self._used, self.detector.used)
 
     def _restore(self) -> None:
-        """Let the detector assume the stated noise again, after frames with noise of their own."""
+        """Let the detector assume the stated noise again after frames that had their own noise levels."""
         if self._stated != self._usual_level:
             self._stated = self._usual_level
             self.detector.set_noise(self._factor, self._usual)
@@ -205,7 +205,7 @@ class RestGate:
             self._field = None
 
     def _is_noisier(self, now: float) -> bool:
-        """Return whether the detector must wait before it adopts the noise ``now`` of a frame."""
+        """Return whether the detector must wait before adopting a frame's noise, ``now``."""
         if not now / self._stated >= NOISIER:
             self._noisier_frames = 0
             return False

@@ -6,7 +6,7 @@ which follows errors in R₀, rounding and creep over minutes.
 
 The prior of the drift is a random walk with a standard deviation of
 :data:`skinnode.solve.detect.gain_drift.DRIFT` after one hour. The drift of the stream is then measured by
-comparing the wires' means over two blocks some seconds apart. The less a stream drifts, the more slowly its
+comparing the wires' means over two blocks a few seconds apart. The less a stream drifts, the more slowly its
 gains follow the readings, and the slower the presses that can still be detected.
 """
 
@@ -52,7 +52,7 @@ START_S: Final = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Parameters of a stream that its slow state requires."""
+    """Stream parameters that the slow state requires."""
 
     filter: GainFilter
     """Filter for the gains."""
@@ -209,7 +209,7 @@ class SlowState:
         return self.level != before
 
     def discard(self) -> None:
-        """Discard the frames that have not been used yet, because of a touch or a gap."""
+        """Discard the frames not yet used, after a touch or a gap."""
         self._clear_block()
         self._waiting = False
         self._means.clear()
@@ -318,5 +318,5 @@ class SlowState:
 
 
 def _least(variances: tuple[float, ...], needed: float) -> int:
-    """Return the index of the first of the ascending ``variances`` that is at least ``needed``."""
+    """Return the index of the first value in the ascending ``variances`` that is at least ``needed``."""
     return min(bisect.bisect_left(variances, 0.999 * needed), len(variances) - 1)

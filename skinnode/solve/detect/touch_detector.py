@@ -46,8 +46,8 @@ NOISE_FRAMES: Final = 400
 NOISE_START: Final = 30
 """Weight of the stated noise, in frames."""
 QUIETER: Final = 0.6
-"""Ratio of a touched frame's noise variance to the average below which the average is considered too
-large."""
+"""Ratio of a touched frame's noise variance to the average noise variance, below which the average is
+considered too large."""
 NOISE_STEP: Final = 1.25
 """Maximum ratio between the average and a frame's noise variance; larger deviations are clipped."""
 
@@ -190,7 +190,7 @@ class TouchDetector:
             self._own = noise.copy()
         self._configure()
         self._slow.carry_on(gains, expected * before / self._sigma)
-        self._crept_peak *= float(np.median(before) / np.median(self._sigma)) ** 2  # an energy over the noise
+        self._crept_peak *= float(np.median(before) / np.median(self._sigma)) ** 2  # in units of noise²
         self._arrays.expected[:] = self._slow.expected
         self._noise, self._noise_frames, self._frames = 1.0, NOISE_START, 0
         if self.touched:
@@ -319,7 +319,7 @@ class TouchDetector:
         return not (doubt or odd)
 
     def _change_test(self) -> None:
-        """Use the slow state's current expected changes and test."""
+        """Apply the slow state's current expected changes, and the test for its current level."""
         self._use_test()
         retest(self._arrays.table, self._test.rows, self._slow.expected, self._at, self._frames)
 

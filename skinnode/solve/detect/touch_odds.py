@@ -1,4 +1,4 @@
-"""Odds of touch versus no touch, updated by Bayes' rule in each frame, for a patch touched occasionally."""
+"""Odds of touch versus no touch, updated by Bayes' rule in each frame, for an occasionally touched patch."""
 
 from __future__ import annotations
 

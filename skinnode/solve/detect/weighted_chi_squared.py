@@ -1,4 +1,4 @@
-"""Tail of a weighted sum of χ² variables, the touch statistic's distribution on an untouched patch.
+"""Tail of the distribution of a weighted sum of χ² variables: the touch statistic on an untouched patch.
 
 The tail of T = Σ w_i z_i² for independent standard normal z_i follows from the cumulant generating function
 K(t) = −½ Σ ln(1 − 2 t w_i) by the saddle-point approximation of Lugannani and Rice (Advances in Applied
@@ -19,7 +19,7 @@ from skinnode.model.layout import Float
 _STEPS: Final = 200
 """Maximum number of steps in each search; 5 to 60 are typical."""
 _TOLERANCE: Final = 1e-6
-"""Relative error of the probability at which the search for a quantile ends."""
+"""Relative error in the probability at which a quantile search ends."""
 _LEAST: Final = 1e-300
 """Smallest probability whose logarithm is used."""
 

@@ -31,7 +31,7 @@ PATIENCE: Final = 4
 """Number of successive interrupted fields after which contacts are computed although the deadline has passed.
 Computing them from a few wires takes up to 7 ms."""
 WILD: Final = 16.0
-"""Ratio of a wire's variance to the median over all wires above which the wire is left out. All variances are
+"""Ratio of a wire's variance to the median of all wires, above which the wire is left out. All variances are
 relative to their values at rest."""
 
 

@@ -47,7 +47,7 @@ If χ² exceeds its quantile for the same probability, a fixed electrode becomes
 at 100 frames/s, noise alone causes this about once every 100 s.
 """
 TINY: Final = 1e-200
-"""Lower limit of squared slopes used as divisors. The limit is below any real squared slope, but large enough
+"""Lower limit on squared slopes used as divisors. The limit is below any real squared slope, but large enough
 to prevent overflow."""
 
 
@@ -71,7 +71,7 @@ class LeftOut:
         # weights of the readings for which it was computed
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
-        # limits of χ², indexed by degrees of freedom
+        # limits on χ², indexed by degrees of freedom
         self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
             np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
             for z in (Z_HOLD, Z_WIDEN, Z_REFUSE)
@@ -90,7 +90,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Fix wires at rest to within the noise; write the standard deviations of fixed coordinates."""
+        """Fix wires that are at rest to within the noise; write fixed coordinates' standard deviations."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -154,7 +154,7 @@ class LeftOut:
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of the wires that have a root within the noise or no fixed electrode."""
+        """Return a mask (U,) of the wires that have a root within the noise or have no fixed electrode."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])

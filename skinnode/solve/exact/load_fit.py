@@ -48,7 +48,7 @@ SCALE_STEPS: Final = 30
 SCALE_CLOSE: Final = 0.01
 """Relative change in s² at which the iteration stops; the relative change in the loads is smaller."""
 SCALE_LEAST: Final = 1e-12
-"""Lower limit of s², in pitch²."""
+"""Lower limit on s², in pitch²."""
 REUSED: Final = 0.25
 """Maximum relative change in s² and in ν² for which the matrices of :class:`Remainder` are reused. Computing
 them takes as long as the rest of the fit."""
@@ -73,7 +73,7 @@ class LoadFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Remainder:
-    """Matrices of a fit without some coordinates, for one s² and ν²."""
+    """Matrices for a fit with some coordinates left out, at one s² and ν²."""
 
     key: bytes
     """Mask of the coordinates left out."""
@@ -146,7 +146,7 @@ class LoadFit:
     def fit_without(self, moved: Float, level: float, left_out: NDArray[np.bool_]) -> LoadEstimate:
         """Return the loads that explain the displacement of all coordinates except ``left_out`` (n,).
 
-        The scale s is computed with the coordinates left out at their most probable displacements. The other
+        The scale s is computed with the left-out coordinates at their most probable displacements. The other
         arguments are those of :meth:`fit`.
         """
         factors = self.factors
@@ -167,7 +167,7 @@ class LoadFit:
         return LoadEstimate(self._load.reshape(-1, 3), known.rows, known.weight, self._share, known.scale2)
 
     def _leave_out(self, key: bytes, columns_t: Float, level: float) -> Remainder:
-        """Compute the matrices of a fit without the coordinates whose columns W are given, as rows (r, n)."""
+        """Compute the matrices of a fit without the coordinates with columns W, given as rows (r, n)."""
         factors, size = self.factors, len(columns_t)
         n, loads = factors.rows.shape
         root = 1.0 / np.sqrt(self._scale2 * factors.gain + level)
@@ -258,7 +258,7 @@ def _fit_scale_without(  # noqa: PLR0913 - a kernel: field, matrices and outputs
     precision: Float,
     unknown: Float,
 ) -> float:
-    """Return s², estimated with the coordinates left out at their most probable displacements.
+    """Return s², estimated with the left-out coordinates at their most probable displacements.
 
     Writes the z of the other coordinates to ``seen`` (n,).
 

@@ -25,8 +25,8 @@ from skinnode.solve.wires.stages import DEADLINE
 BRIDGES: Final = (3, 5, 10)
 """Numbers of substeps in successive bridges.
 
-On the staggered layout (h = 0.5), 3 substeps solved every wire after a press of 50 % of h within one frame; 5
-substeps solved 23 of 24 wires after a press of 70 %. Adaptive substeps that stay on the branch of the rest
+On the staggered layout (h = 0.5), 3 substeps solved every wire after a press of 50 % of h in a single frame;
+5 substeps solved 23 of 24 wires after a press of 70 %. Adaptive substeps that stay on the branch of the rest
 position solved fewer wires, because the straight line in R crosses folds that the press avoids.
 """
 BRIDGE_TOLERANCE: Final = 1e-6

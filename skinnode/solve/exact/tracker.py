@@ -1,4 +1,4 @@
-"""Exact tracker: solves each frame of a live stream, starting at the solution for the previous frame.
+"""Exact tracker: solves each frame of a live stream, starting from the solution for the previous frame.
 
 Each wire passes through these stages until one of them finds a root of F = b:
 
@@ -133,7 +133,7 @@ class ExactTracker:
         self._noise_estimate = noise_estimate
 
     def reset(self) -> None:
-        """Discard the state of the stream; the solve of the next frame starts at the rest position."""
+        """Discard the state of the stream; the next frame is solved from the rest position."""
         self._stream.reset()
         self._left_out.reset()
         self.arrays.order[:], self._waiting = self._in_order, False

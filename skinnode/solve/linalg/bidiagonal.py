@@ -1,6 +1,6 @@
 """Bidiagonal form of a small matrix, for the damped steps of Levenberg-Marquardt.
 
-Levenberg-Marquardt tries several damping parameters per Jacobian. With the bidiagonal form, each of them
+Levenberg-Marquardt tries several damping parameters per Jacobian. With the bidiagonal form, each parameter
 takes O(n) operations instead of O(n³).
 """
 

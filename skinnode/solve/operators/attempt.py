@@ -33,7 +33,7 @@ of Brown & Dennis.
 class System:
     """Wrapper around the caller's functions that counts calls and validates the returned arrays.
 
-    The returned array can be the caller's own, which the next call may overwrite.
+    The returned array can be the caller's own, and the next call may overwrite it.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class System:
 
     @property
     def steps(self) -> int:
-        """Number of trial points so far: evaluations of r except the first."""
+        """Number of trial points so far: all evaluations of r except the first."""
         return self.evaluations - 1
 
 

@@ -38,4 +38,4 @@ The limit is larger than for a root, because rounding of ‖r‖² hides relativ
 STATIONARY: Final = 1e-6
 """Fraction of ‖J_j‖ ‖r‖ below which component j of the gradient Jᵀr counts as zero (rounding error)."""
 STALL_LIMIT: Final = 30
-"""Maximum number of steps of a tall system (m > n) in which ‖r‖² changes only by rounding errors."""
+"""Maximum number of steps in which ‖r‖² changes only by rounding errors, for a tall system (m > n)."""

@@ -29,8 +29,8 @@ CURVED: Final = 0.05
 """Limit above which the smallest scaled eigenvalue of the Hessian is considered positive.
 
 On the problems of Moré, Garbow & Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38
-at isolated minima. The exception is Watson's problem with n = 12: because of rounding errors, it is 0.003 at
-the minimum.
+at isolated minima. The exception is Watson's problem with n = 12, where rounding errors reduce the eigenvalue
+at the minimum to 0.003.
 """
 CONTRACTION: Final = 0.5
 """Ratio of the sizes of successive Newton steps above which the iteration ends."""

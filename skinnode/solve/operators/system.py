@@ -137,7 +137,7 @@ def _solve(  # noqa: PLR0913 - the arguments of solve_system
 
 
 def _best(attempts: list[Attempt], tol_x: float, steps: int) -> Attempt:
-    """Return the attempt with the smallest residual, with its point classified."""
+    """Classify the point of the attempt with the smallest residual, and return the attempt."""
     best = min(attempts, key=lambda each: each.norm)
     if best.kind is PointKind.UNFINISHED and best.went != op.INVALID_START:
         best.settle(tol_x, steps)

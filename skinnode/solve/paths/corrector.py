@@ -113,7 +113,7 @@ class Corrector:
         tasks: int = 0,
         operator: int | None = None,
     ) -> None:
-        """Solve wires, starting at their current positions; update :attr:`solver` and the log.
+        """Solve wires, starting from their current positions; update :attr:`solver` and the log.
 
         Args:
             todo: (U,) action for each wire: LEAVE, SOLVE or PREDICT (:mod:`skinnode.solve.wires.arrays`).

@@ -36,7 +36,7 @@ from skinnode.solve.posterior.frame_estimator import FrameEstimator
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
-"""Accuracy of a solve that starts at the posterior estimate.
+"""Accuracy of a solve that starts from the posterior estimate.
 
 The tolerance is the paper's tolerance for the last sample. The maximum number of steps is the paper's limit
 for all earlier samples.

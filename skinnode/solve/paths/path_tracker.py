@@ -144,7 +144,7 @@ class PathTracker:
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
 
     def solve(self, sample: int, accuracy: Accuracy) -> Index:
-        """Solve a sample for all wires, starting at their current positions.
+        """Solve a sample for all wires, starting from their current positions.
 
         Returns:
             (U,) numbers of steps; 0 if the first-order optimality was below the tolerance at the start.
@@ -255,7 +255,7 @@ class PathTracker:
         )
 
     def at_path_end(self) -> Mask:
-        """Return a mask (U,) of the wires at the end of their path with a plausible displacement."""
+        """Return a mask (U,) of the wires at the end of their path and with a plausible displacement."""
         apart = roots.distance(self.solver.x, self._path_end)
         size = roots.distance(self._path_end, self.problem.rest)
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())

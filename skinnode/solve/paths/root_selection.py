@@ -24,7 +24,7 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum number of steps in a solve that starts at the smoothest displacement (:func:`guide`).
+"""Maximum number of steps in a solve that starts from the smoothest displacement (:func:`guide`).
 
 Solves that start near a root take 1 to 20 steps. Others do not converge.
 """
@@ -52,7 +52,7 @@ def doubtful(tracker: PathTracker) -> Mask:
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
-    """Solve the last sample again, starting at the smoothest displacement that explains it.
+    """Solve the last sample again, starting from the smoothest displacement that explains it.
 
     If the new root is across a fold, its twin on the same side as the rest position is used instead. For each
     wire, the smoother of the old and new solutions is kept. If no new root is found, the wire is not
@@ -105,7 +105,7 @@ def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
 def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accuracy: Accuracy) -> None:
     """Compare every root with an estimate of the whole patch.
 
-    A wire that has no root, or whose root contradicts the estimate, is solved again, starting at the
+    A wire that has no root, or whose root contradicts the estimate, is solved again, starting from the
     estimate. A new root across a fold is accepted only if the path led to the same root, because the skin
     itself can cross a fold.
     """

@@ -142,7 +142,7 @@ class Periodic:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Find the cycle unless it is given, then solve the last sample of each cycle, starting at rest."""
+        """Find the cycle unless it is given, then solve the last sample of each cycle, starting from rest."""
         tracker.cycle, tolerance = self.cycle, self.intermediate_tolerance
         if tracker.cycle is None:
             tracker.cycle, tolerance = self._search(tracker)
@@ -195,10 +195,10 @@ class Adaptive:
     an Euler step is proportional to the square of its length (Deuflhard 2004, section 5.1.3). A step that
     does not reach a root on the branch of the rest position is undone, and the next step is half as long.
 
-    Interpolated resistances do not belong to a deformation of the skin, so the path can reach a fold (det J =
-    0) even if the press does not. If a wire cannot pass a fold, or its root is too rough for a press, it is
-    solved again with Levenberg-Marquardt, starting at the smoothest displacement that explains the last
-    sample (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
+    Interpolated resistances do not correspond to any deformation of the skin, so the path can reach a fold
+    (det J = 0) even if the press does not. If a wire cannot pass a fold, or its root is too rough for a
+    press, it is solved again with Levenberg-Marquardt, starting from the smoothest displacement that explains
+    the last sample (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
 
     One sample is enough, because the path starts at rest and ends at the last sample. If there are more
     samples, the wires with doubtful roots are also followed sample by sample, as are the wires that moved far
@@ -254,7 +254,7 @@ class Adaptive:
 
 
 def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
-    """Solve the last sample; reject doubtful roots if ``how.plain``, otherwise solve these wires again."""
+    """Solve the last sample; reject doubtful roots if ``how.plain``, otherwise solve their wires again."""
     accuracy = Accuracy(how.final_tolerance, how.final_steps)
     if not how.plain:
         tracker.extrapolate(tracker.samples - 1)

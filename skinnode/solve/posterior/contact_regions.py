@@ -148,7 +148,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write ``cell`` and its neighbours, if they have an electrode, into ``out``; return their number."""
+    """Write those of ``cell`` and its neighbours that have an electrode into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:

@@ -54,7 +54,7 @@ class LoadEstimate:
     rows: Float
     """(m, 3Q) rows of the information about the loads."""
     weight: Float
-    """(m,) weight of each row; negative for rows that remove the information of coordinates left out."""
+    """(m,) weight of each row; negative for rows that remove the information about left-out coordinates."""
     share: Float
     """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float

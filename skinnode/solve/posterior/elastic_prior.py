@@ -64,7 +64,7 @@ class ElasticPrior:
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """Return the prior of ``layout`` on ``rubber``. The modulus of the rubber scales only the forces.
+        """Return the prior for ``layout`` on ``rubber``. The modulus of the rubber scales only the forces.
 
         Patches of the same layout share one prior, whose arrays must not be modified.
         """
@@ -104,10 +104,10 @@ def _elastic_prior(layout: PatchLayout, rubber: Rubber) -> ElasticPrior:
 def bonded_response(layout: PatchLayout) -> Float:
     """Return the response (3UN, Q) of a bonded layer to normal loads, in pitches per unit load.
 
-    The layer is incompressible, and its thickness equals the height of the electrodes. This support differs
-    from a half-space more than any other: around a contact, the surface moves sideways, away from the
-    contact, rather than downwards. For loads with a standard deviation of 1, the median standard deviation of
-    the normal displacement is :data:`LAYER_SHARE` pitches.
+    The layer is incompressible, and its thickness equals the height of the electrodes. No support differs
+    more from a half-space: around a contact, the surface moves sideways, away from the contact, rather than
+    downwards. For loads with a standard deviation of 1, the median standard deviation of the normal
+    displacement is :data:`LAYER_SHARE` pitches.
     """
     cells = LoadCells.of(layout)
     radius_m = math.sqrt(cells.size_m[0] * cells.size_m[1] / math.pi)  # disc with the area of a cell

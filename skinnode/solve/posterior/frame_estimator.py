@@ -51,9 +51,9 @@ LEFT_OUT: Final = 3
 """Maximum number of inconsistent wires left out of a frame. If there are more, all wires of the frame are
 INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""Minimum duration of a solve from rest, relative to the time to factorise the equations of all wires and
-compute their standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long as
-this computation."""
+"""Minimum duration of a solve from rest, relative to the time taken to factorise the equations of all wires
+and compute their standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long
+as this computation."""
 
 Mask = NDArray[np.bool_]
 
@@ -300,7 +300,7 @@ class FrameEstimator:
     def see_noise(self, ohm: Float, noise: Float, rounding_ohm: Float | None, valid: Mask | None) -> None:
         """Pass a frame to the noise estimate; see :meth:`NoiseEstimate.see` for the arguments."""
         if self.noise_estimate is not None and self.noise_estimate.see(ohm, noise, rounding_ohm, valid):
-            self._seen = np.zeros_like(self._seen)  # the trusted field assumed a different noise
+            self._seen = np.zeros_like(self._seen)  # the trusted field assumed a different noise level
 
     def _observe(self, readings: Readings) -> Observation:
         return self._model.observe(readings, self._hyper.noise_factor)
@@ -314,7 +314,7 @@ class FrameEstimator:
         """Return whether the last field explains the frame to within the noise.
 
         For wires that were used to compute the last field, the noise variance is doubled, because the field
-        contains the noise of its own frame.
+        carries the noise of its own frame.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
@@ -381,7 +381,7 @@ class FrameEstimator:
     def _joining_early(self, observation: Observation, wanted: Index) -> Index:
         """Return the wires outside ``wanted`` that contradict an annealed field, if discs are fitted to it.
 
-        If these wires joined only when the discs had been fitted, the discs would be fitted again.
+        If these wires joined only after the discs had been fitted, the discs would have to be fitted again.
         """
         if not self._annealed or self._hyper.discs is None:
             return self._wires[:0]
@@ -437,9 +437,9 @@ class FrameEstimator:
         """Anneal from rest, and keep the tracked or the annealed field, whichever is more likely.
 
         This method is called after a large movement, because tracking can then end at a wrong maximum. The
-        annealed field expects equal loads over the whole patch. With discs, it is therefore compared with the
-        maximum near the tracked field under the same prior. Unless it is clearly more likely, the discs stay
-        in use, and are fitted to data linearised at that maximum.
+        annealed field is based on equal expected loads over the whole patch. With discs, it is therefore
+        compared with the maximum near the tracked field under the same prior. Unless the annealed field is
+        clearly more likely, the discs stay in use and are fitted to data linearised at that maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved

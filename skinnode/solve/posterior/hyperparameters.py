@@ -44,8 +44,9 @@ REFIT: Final = 0.1
 which the discs are refitted."""
 REFIT_NOISE: Final = 0.8
 """Noise of a frame, relative to that of the frame to which the discs were fitted, below which the discs are
-refitted. The same applies if the noise increases by the reciprocal. With earlier frames, the noise of a held
-touch falls, and the discs of its first frame would be those of a single noisy frame."""
+refitted. The discs are also refitted if the noise increases by the reciprocal factor. As earlier frames are
+included, the noise of a held touch falls; without a refit, the discs would remain those of the first, noisy
+frame."""
 RETRY: Final = 2.0
 """Growth of the largest displacement, in units of the noise, after which discs are tried again for a touch
 whose loads were not found to be local. At the beginning of a slow press, noise hides where the loads are."""
@@ -192,7 +193,8 @@ class Hyperparameters:
     def return_to(self, discs: Float) -> None:
         """Return to the prior before :meth:`spread_as_seen`.
 
-        The next fit starts at the strongest disc alone, so that others are used only if they still pay.
+        The next fit starts at the strongest disc alone, so that other discs are used only if they are still
+        worthwhile.
         """
         assert self.discs is not None
         self.discs.discs = discs[[np.argmax(discs[:, 3])]]

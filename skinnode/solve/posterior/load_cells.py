@@ -91,7 +91,7 @@ def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire with one electrode has no direction; derive it
+    else:  # a single electrode gives no wire direction; derive it
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:

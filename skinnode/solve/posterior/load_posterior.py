@@ -60,7 +60,7 @@ class LoadPosterior:
         return self._prior.loads(self._estimator.free_displacement())
 
     def expected(self, least: float) -> Float:
-        """Return the prior variances (Q,) of the loads for the next solve, in pitch²; minimum ``least``.
+        """Return the prior variances (Q,) of the loads for the next solve, in pitch², at least ``least``.
 
         Let k = Σ (L⁻¹ J G)² be the sensitivity of the data to a load with posterior mean q and prior variance
         s². Without its own prior, the estimate of the load is q / (s² k), with variance 1/k − s² (Tipping and

@@ -1,4 +1,4 @@
-"""Prior for the loads on a patch, and of the displacement that they cause.
+"""Prior for the loads on a patch, and for the displacement that they cause.
 
 Initially, the prior expects equal loads over the whole patch, with a single scale s². Once loads have been
 found, the prior expects loads mainly in the same places: in discs (:meth:`LoadPrior.set_discs`), or in the
@@ -191,8 +191,8 @@ class LoadPrior:
         """Return the load variances (Q,) for the next solve, in pitch².
 
         Each variance moves halfway from its current value to the value indicated by the loads found. With
-        full steps, the variances of neighbouring cells would oscillate. A full step is taken only from equal
-        expected loads, and only if a press is certain.
+        full steps, the variances of neighbouring cells would oscillate. A full step is taken only if the
+        expected loads are still equal and a press is certain.
 
         Args:
             found: (Q,) squared loads found in the frame, in pitch².

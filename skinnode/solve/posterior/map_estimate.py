@@ -3,8 +3,8 @@
 - Chord steps start at the last field and reuse the factors of an earlier frame. A typical solve needs two
   evaluations of F and its Jacobian.
 - A Gauss-Newton step computes new factors at the current field, and is followed by chord steps.
-- Annealing starts at rest and assumes a noise of 3 %, which it divides by four in each step until the actual
-  noise is reached. At high noise, the posterior has a single maximum, near the maximum of the prior.
+- Annealing starts at rest with an assumed noise of 3 %, which is divided by four in each step until it
+  reaches the actual noise. At high noise, the posterior has a single maximum, near the maximum of the prior.
   Following this maximum as the noise decreases usually leads to the correct maximum, even if a press indents
   the layer by 70 % of its thickness within one frame.
 """
@@ -137,7 +137,7 @@ class MapEstimator:
 
     @property
     def equations(self) -> int:
-        """Number of equations of all wires after the QR reduction."""
+        """Total number of equations of all wires after the QR reduction."""
         return len(self._b.v)
 
     @property
@@ -148,7 +148,7 @@ class MapEstimator:
 
     @property
     def core(self) -> Float:
-        """Standard deviations (U, f) for the 95 % interval, which assume smooth bodies, in pitches."""
+        """Standard deviations (U, f) for the 95 % interval, assuming smooth bodies, in pitches."""
         self._finish_measuring()
         return self._core
 
@@ -503,8 +503,8 @@ class MapEstimator:
     def _measure(self, observation: Observation) -> None:
         """Compute the posterior variances from the current factors.
 
-        The part of the variances that is due to noise is computed when it is needed, because solves that
-        only lead to a better prior do not need it.
+        The part of the variances due to noise is computed only when needed, because solves that merely lead
+        to a better prior do not need it.
         """
         b, m, prior = self._b, self.factored_rows, self.load_prior
         self._gamma = None
@@ -518,7 +518,7 @@ class MapEstimator:
         self._enough = math.sqrt(prior.smooth_share) * most, most
 
     def _finish_measuring(self) -> None:
-        """Compute the standard deviations from the posterior variances, unless this has been done."""
+        """Compute the standard deviations from the posterior variances, unless this has already been done."""
         if self._unfinished is None:
             return
         (d, doubt, share), self._unfinished = self._unfinished, None
@@ -537,7 +537,8 @@ class MapEstimator:
     def _is_enough(self, size: float) -> bool:
         """Return whether a chord step of RMS ``size``, in pitches, is small compared with :attr:`core`.
 
-        Noise causes between none and all of the variance. ``core`` is computed only if this decides.
+        Noise accounts for anywhere from none to all of the variance. ``core`` is computed only if the result
+        depends on it.
         """
         if self._enough[0] < size <= self._enough[1]:
             self._finish_measuring()

@@ -27,7 +27,7 @@ class Readings:
     """Resistances of one frame, in the units of :class:`PatchProblem`."""
 
     a: Float
-    """(U, K) resistances times gain, R · gain; the rest value where a resistance is unusable."""
+    """(U, K) resistances times gain, R · gain; the value at rest where a resistance is unusable."""
     noise: Float
     """(U, K) relative standard deviation of the resistances R."""
     usable: NDArray[np.bool_]
@@ -40,7 +40,7 @@ class Readings:
         return Readings(self.a, self.noise, usable)
 
     def except_for(self, left_out: NDArray[np.bool_]) -> Readings:
-        """Return a copy in which the readings in the mask ``left_out`` (U, K) are unusable."""
+        """Return a copy in which the readings selected by the mask ``left_out`` (U, K) are unusable."""
         return Readings(self.a, self.noise, self.usable & ~left_out)
 
 

@@ -29,8 +29,8 @@ PLACED: Final = 2.0
 """Assumed error of a reading per pitch of placement error, as a fraction of the largest change in any
 reading."""
 RESOLVE: Final = 0.75
-"""Ratio of the filtered noise to the filtered noise in the last solve, below which a frame is solved again
-even if the last field explains it. The reciprocal is the limit for an increase."""
+"""Ratio of the filtered noise to that in the last solve below which a frame is solved again even if the last
+field explains it. The reciprocal is the limit for an increase."""
 DITHERED: Final = 2.0
 """Minimum ratio of a reading's noise to its quantization error at which averaging reduces the quantization
 error."""

@@ -1,9 +1,9 @@
 """Moves the contacts of a field to the time at which the first upper wire was sampled.
 
-A contact belongs to the time at which the upper wire nearest to its centre was sampled. Its values at the
-time of the first wire are interpolated between the contact and the same contact in the scan before, as those
-of a wire are (:mod:`skinnode.solve.skew.scan_skew`). The contacts of two scans are the same if their centres
-are close to each other. A contact that is new in a scan had no load in the scan before.
+A contact is assigned the time at which the upper wire nearest to its centre was sampled. Its values at the
+time of the first wire are interpolated between the contact and the same contact in the previous scan, like
+those of a wire (:mod:`skinnode.solve.skew.scan_skew`). Contacts in two scans are considered the same if their
+centres are close to each other. A contact that is new in a scan had no load in the previous scan.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from skinnode.solve.skew.interpolation import timing_variance
 
 SAME_CONTACT: Final = 2.0
 """Maximum distance, in pitches, between the centres of a contact in two successive scans. A body that slides
-faster, 100 mm/s at 12.5 scans per second and a pitch of 4 mm, is considered a new contact."""
+faster (100 mm/s at 12.5 scans per second and a pitch of 4 mm) is considered a new contact."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactScan:
-    """Contacts of a field, before they are interpolated."""
+    """Contacts of a field, before interpolation."""
 
     t_ns: int
     """Time of the scan, in ns."""
@@ -118,7 +118,7 @@ def _without_load(values: Float) -> Float:
 
 
 def _contact(contact: Contact, values: Float, std: Float) -> Contact:
-    """Return the contact with other values."""
+    """Return a copy of the contact with the given values."""
     return dataclasses.replace(
         contact,
         centroid_m=values[:3],

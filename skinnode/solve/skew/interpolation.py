@@ -10,11 +10,11 @@ from skinnode.model.layout import Float
 def timing_variance(f: Float | float) -> Float:
     """Return the variance of an interpolated value, relative to the square of its deviation Δ from a line.
 
-    Δ is the difference between the last value and the line through the two values before it. Its cause lies
-    at a random time between the last two scans:
+    Δ is the difference between the last value and the line through the two values before it. Its cause
+    occurred at a random time between the last two scans:
 
-    - A jump by Δ. With a probability of 1 − f, the value has already jumped. The interpolation is the mean,
-      and its variance is f (1 − f) Δ².
+    - A jump by Δ. With a probability of 1 − f, the value has already jumped. The interpolated value is the
+      mean, and its variance is f (1 − f) Δ².
     - A change of speed at a time s (in intervals) before the last scan. The error is (1 − f) Δ if s < f,
       otherwise f (1/s − 1) Δ. The mean square over s is 2 f (1 − f + f ln f) Δ².
 

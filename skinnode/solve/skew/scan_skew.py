@@ -1,19 +1,20 @@
 """Moves the fields of a stream to the time at which the first upper wire of each scan was sampled.
 
 A board samples the upper wires of a scan one after the other. While the skin moves, each wire of a solved
-field therefore belongs to a different time: wire u to the time t + u τ, where t is the time of the scan and τ
-the row time. The displacement x of a wire at the time t is interpolated between the last two scans, which
-sampled the wire at t' + u τ and at t + u τ:
+field therefore refers to a different time: wire u to time t + u τ, where t is the time of the scan and τ the
+row time. The displacement x of a wire at the time t is interpolated between the last two scans, which sampled
+the wire at t' + u τ and at t + u τ:
 
     x(t) ≈ (1 − f) x(t + u τ) + f x(t' + u τ),    f = u τ / (t − t')
 
-Interpolation does not raise the noise. Fields are interpolated, not readings, because readings are not linear
-in the displacement, and because a mixture of the readings before and after a jump belongs to no displacement.
+Interpolation does not increase the noise. Fields are interpolated, not readings, because readings are not
+linear in the displacement, and because a mixture of the readings before and after a jump does not correspond
+to any displacement.
 
 The error of the interpolation is estimated from Δ, the difference between the last scan and the line through
-the two scans before it: Δ may be a jump or a change of speed at an unknown time between two scans
-(:mod:`skinnode.solve.skew.interpolation`). Its variance is added to that of the field, reduced by the part of
-Δ that the noise of the fields explains.
+the two scans before it: Δ may be due to a jump or a change of speed at an unknown time between two scans
+(:mod:`skinnode.solve.skew.interpolation`). Its variance, reduced by the part of Δ that the noise of the
+fields explains, is added to that of the field.
 
 The loads and contacts of the field are interpolated in the same way.
 """
@@ -40,9 +41,9 @@ class _Solved:
     moved_m: Float
     """(U, N, 3) displacement, in m."""
     std_m: Float
-    """(U, N, 3) standard deviation, in m; 0 if the wire is not known."""
+    """(U, N, 3) standard deviation, in m; 0 if the wire has no usable solution."""
     core_m: Float
-    """(U, N, 3) standard deviation without the enlargement for large errors of the prior, in m."""
+    """(U, N, 3) standard deviation without the allowance for large errors of the prior, in m."""
     force_n: Float
     """(U, N, 3) loads, in N; 0 if they are not estimated."""
     t_ns: NDArray[np.int64]
@@ -76,7 +77,7 @@ class _Solved:
 
 
 class ScanSkew:
-    """Last two fields of a patch, with which the next field is interpolated.
+    """Last two fields of a patch, used to interpolate the next field.
 
     Each stream needs its own instance.
 
@@ -102,7 +103,7 @@ class ScanSkew:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all fields. The next field is not changed."""
+        """Forget all fields. The next field is returned unchanged."""
         self._last: _Solved | None = None
         self._before: _Solved | None = None
         self._contacts: tuple[ContactScan, ...] = ()  # of the last two fields
@@ -112,8 +113,8 @@ class ScanSkew:
     def at_first_wire(self, field: FieldFrame, t_ns: int | None) -> FieldFrame:
         """Return a field at the time at which the first upper wire was sampled.
 
-        A wire is not changed if it has no solution in this field or no earlier solution. The field of a patch
-        at rest is not changed, nor is a field that contradicts its readings.
+        A wire is left unchanged if it has no solution in this field or no earlier solution. The field of a
+        patch at rest is left unchanged, as is a field that contradicts its readings.
 
         Args:
             field: Next field of the stream, in which each upper wire belongs to its own time.
@@ -134,7 +135,7 @@ class ScanSkew:
         return amended(field, contacts=interpolated_contacts(self._layout, self._late_ns, scan, scans))
 
     def _advance(self, t_ns: int | None) -> int:
-        """Return the time of the next frame, ns; without given times, one period after the last frame."""
+        """Return the time of the next frame, in ns; without given times, one period after the last frame."""
         given, self._given_ns = self._given_ns, t_ns
         self._now_ns += self._period_ns if t_ns is None or given is None else t_ns - given
         return self._now_ns
@@ -185,10 +186,10 @@ def _interpolated(
 
 
 def _unexplained(off2: Float, noise2: Float) -> float:
-    """Return the part of the squared deviations that noise does not explain, 0 to 1.
+    """Return the fraction (0 to 1) of the squared deviations that noise does not explain.
 
-    The wire that deviates most decides for the whole patch. If it has changed its speed, the deviations of
-    the other wires are considered real, even if they are as small as their noise.
+    The wire with the largest deviations determines the result for the whole patch. If it has changed its
+    speed, the deviations of the other wires are considered real, even if they are as small as their noise.
 
     Args:
         off2: (U, N, 3) squared deviations of the last scan from a line, in m².

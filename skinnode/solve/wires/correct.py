@@ -55,7 +55,7 @@ Z_95_ONE_SIDED: Final = 1.645
 
 @njit_part
 def _data_rounding(inverse: Float, weight: Float) -> float:
-    """Return the largest coordinate error caused by rounding of a F."""
+    """Return the largest coordinate error caused by rounding the product a F."""
     top = 0.0
     for j in range(inverse.shape[0]):
         row, total = inverse[j], 0.0

@@ -32,10 +32,10 @@ accuracy --only families``, drawn with seeds that the benchmark does not use."""
 SHARE_MOVED: Final = 3.4
 """Factor by which s is larger for the coordinate that moves farthest."""
 SHARE_RADIUS: Final = 1.4
-"""Exponent of the strongest disc's radius in s."""
+"""Exponent of the strongest disc's radius in the formula for s."""
 SHARE_LEAST_RADIUS: Final = 0.9
-"""Minimum radius in the computation of s, in cells. Without it, the 95 % intervals of small bodies on a thin
-bonded layer contain fewer errors: 80 % instead of 81 % in the worst of 16 presses."""
+"""Minimum radius in the computation of s, in cells. Without it, the 95 % intervals for small bodies on a thin
+bonded layer cover fewer errors: 80 % instead of 81 % in the worst of 16 presses."""
 SHARE_DISC: Final = 1.35
 """Factor by which each further disc increases s. Several discs indicate loads that no single disc fits."""
 SHARE_UNKNOWN: Final = 0.28
@@ -43,12 +43,13 @@ SHARE_UNKNOWN: Final = 0.28
 MOVED: Final = 0.1
 """Displacement, relative to the largest displacement, at which half of :data:`SHARE_MOVED` applies."""
 LOCAL_MOST: Final = 0.1
-"""Standard deviation of the displacement due to an undetected local touch if there are no readings, in
-clearances."""
+"""Standard deviation, in clearances, of the displacement due to an undetected local touch if there are no
+readings."""
 LOCAL_NOTICED: Final = 2.0
-"""Standard deviation of an undetected displacement of a single coordinate, in standard deviations of its
-best estimate with all other coordinates fixed. Bodies that moved a single electrode by up to 7 of these
-standard deviations were not found, because their readings resembled those of a larger contact nearby."""
+"""Standard deviation of an undetected displacement of a single coordinate, relative to the standard deviation
+of its best estimate with all other coordinates fixed. Bodies that moved a single electrode by up to 7 of
+these standard deviations were not found, because their readings resembled those of a larger contact
+nearby."""
 
 
 def prior_shares(displacement: Float, unknown: Float, discs: Float) -> Float:

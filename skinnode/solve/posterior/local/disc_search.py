@@ -1,11 +1,11 @@
 """Fits soft load discs to a frame.
 
-The data are linearised at the current displacement, and whitened with the covariance expected on an
-untouched skin, whose loads are equally small everywhere. The first disc is placed where a load, on a half-
-space or on a thin bonded layer, matches the whitened data best, and is then fitted
-(:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a load matches the remaining
-data best, as long as the gain in evidence outweighs the additional parameters. In a stream, the search
-starts at the discs of the last frame.
+The data are linearised at the current displacement, and whitened with the covariance expected for untouched
+skin, where all loads are equally small. The first disc is placed where a load, on a half- space or on a thin
+bonded layer, matches the whitened data best, and is then fitted
+(:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a load matches the remaining data
+best, as long as the gain in evidence outweighs the additional parameters. In a stream, the search starts from
+the discs of the last frame.
 
 No disc is used if equal loads over the whole patch explain the frame better than the discs, or if the loads
 require many or large discs.
@@ -31,8 +31,8 @@ from skinnode.solve.posterior.observation import Observation
 EXPECTED: Final = 0.1
 """Expected amplitude a of a disc, in clearances per unit load."""
 AMPLITUDE_MOST: Final = 1.6
-"""Maximum ln a, relative to the expected value. A much larger load outside the patch could imitate a plate
-over the whole patch."""
+"""Maximum ln a, relative to the expected value. A much larger load outside the patch could mimic a plate that
+covers the whole patch."""
 LAYER_RANGE: Final = (0.02, 5.0)
 """Minimum and maximum layer share β."""
 BEYOND: Final = 1
@@ -43,11 +43,11 @@ SHAPES: Final = ((kernels.RADIUS, kernels.LAYER), (0.6, 4.0))
 """Radius R in cells and layer share β at which the search for a new disc starts: a contact on a half-space,
 and one on a thin bonded layer, which moves the skin only near the body."""
 REACH: Final = 1.7
-"""Distance beyond a disc's radius up to which the effects of loads are computed, in cells. It leaves room for
-a step in the position or in the radius."""
+"""Distance beyond a disc's radius up to which the effects of loads are computed, in cells. This leaves room
+for a step in position or radius."""
 EDGE: Final = 0.8
-"""Distance beyond a disc's radius at which the load variance is a tenth of that in the middle, in cells. If
-the effects of loads at a smaller distance are missing, they are computed, and the search continues."""
+"""Distance beyond a disc's radius at which the load variance is a tenth of its value at the centre, in cells.
+If the effects of any loads within this distance are missing, they are computed, and the search continues."""
 EXTENSIONS: Final = 3
 """Maximum number of times that a search continues with more cells."""
 ROUNDS: Final = 2
@@ -61,8 +61,8 @@ PAYS: Final = 2.0
 """Minimum gain in log evidence for adding another disc, in excess of the logarithm of the number of
 parameters."""
 YIELDS: Final = 1.0
-"""Further gain that is expected when the other discs yield to a new one. If the gain misses the minimum by no
-more than this, it is computed with all discs."""
+"""Further gain expected when the other discs adapt to a new one. If the gain falls short of the minimum by no
+more than this, it is recomputed with all discs refitted."""
 NOTICED: Final = 8.0
 """Minimum squared match between a load and the remaining data at which another disc is tried, in noise
 variances."""
@@ -132,16 +132,16 @@ class DiscPrior:
     ) -> Float | None:
         """Fit the discs to a frame, and return the load variances (2, Q), in pitch².
 
-        The estimator's factors are overwritten. The first discs of a touch, which are fitted again, have no
-        :attr:`spread`.
+        The estimator's factors are overwritten. The first discs of a touch have no :attr:`spread`, because
+        they are fitted again.
 
         Args:
             observation: The frame.
             members: Wires whose equations are used.
             untouched2: s² of the loads on untouched skin, in pitch².
             uniform2: s² of equal loads over the whole patch, in pitch².
-            everywhere: Whether the discs are new. In this case, another disc is tried wherever a load matches
-                the remaining data best. Otherwise, discs beyond the current ones are tried only if the match
+            everywhere: Whether the discs are new. If so, another disc is tried wherever a load matches the
+                remaining data best. Otherwise, discs beyond the current ones are tried only if the match
                 exceeds :data:`NOTICED`.
 
         Returns:
@@ -200,9 +200,10 @@ class _Search:
     def places_of_next(self, discs: Float) -> tuple[Float, bool]:
         """Return cells (P, 2) where another disc may be needed, and whether they are beyond the discs.
 
-        There are none if no disc is needed. In one of two cells, a load on a half-space matches the remaining
-        data best; in the other, a load on a bonded layer does. If no match is noticed, but the discs are from
-        an earlier field, the cells are inside the discs, whose loads may have become unequal.
+        There are none if no disc is needed. If there are two cells, a load on a half-space matches the
+        remaining data best in one of them, and a load on a bonded layer in the other. If no match is noticed,
+        but the discs are from an earlier field, the cells are inside the discs, whose loads may have become
+        unequal.
         """
         p = self._p
         if len(discs) == MOST:
@@ -225,8 +226,8 @@ class _Search:
     def with_disc_at(self, places: Float, discs: Float, *, beyond: bool) -> tuple[Float, float]:
         """Return ``discs`` with another disc near one of ``places``, and the resulting gain in evidence.
 
-        The other discs change only if the new disc may pay. If ``places`` are not ``beyond`` the discs, no
-        further cells are used.
+        The other discs are refitted only if the new disc might be worthwhile. If ``places`` are not
+        ``beyond`` the discs, no further cells are used.
         """
         p, before = self._p, self.evidence
         own = self._loads.near(places, np.full(len(places), kernels.RADIUS + REACH), include=beyond)
@@ -254,7 +255,7 @@ class _Search:
         return found, gain
 
     def _set_unit(self, place: Float) -> None:
-        """Compute the noise variance of the matches of loads like those at ``place``."""
+        """Compute the noise variance of the match for loads like those at ``place``."""
         p, rows_t = self._p, self._loads.rows_t
         near = p._near[np.argmin(((p._place - place) ** 2).sum(axis=1))][self._loads.cells]
         self._unit[0] = ((near @ rows_t[2::LOADS]) ** 2).sum()

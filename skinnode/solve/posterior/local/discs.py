@@ -259,8 +259,8 @@ def climb(  # noqa: PLR0913, C901 - a kernel: arrays by name
 ) -> float:
     """Improve the discs (D, 5) in place by a coordinate search; return their evidence plus log prior.
 
-    After a sweep without an improvement, smaller steps are tried only in the direction in which the gain of
-    the larger step was greater.
+    After a sweep without an improvement, smaller steps are tried only in the direction in which the larger
+    step gained more.
 
     Args:
         discs: (D, 5) row, column, ln R, ln a and ln β of each disc.

@@ -1,4 +1,4 @@
-"""Effects of the loads on one frame's whitened data, computed for more cells as a search needs them."""
+"""Effects of the loads on one frame's whitened data, computed for further cells as a search needs them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from skinnode.solve.posterior.local.discs import LOADS, Effects, Scratch
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 FARTHEST: Final = 4.7
-"""Maximum distance between a cell and the place for which its effects are computed, in cells. A disc that
+"""Maximum distance between a place and the cells whose effects are computed for it, in cells. A disc that
 needs loads at a greater distance is too wide to be used."""
 
 
 class Room(NamedTuple):
-    """Memory for the effects of up to Q cells on up to m data."""
+    """Memory for the effects of up to Q cells on up to m data values."""
 
     gram: Float
     """(4Q, 4Q) products of the effects."""
@@ -28,7 +28,7 @@ class Room(NamedTuple):
 
     @classmethod
     def of(cls, cells: int, data: int) -> Room:
-        """Return memory for ``cells`` cells and ``data`` data."""
+        """Return memory for ``cells`` cells and ``data`` data values."""
         loads = LOADS * cells
         return cls(np.empty((loads, loads)), np.empty(loads * data))
 
@@ -62,7 +62,8 @@ class LoadEffects:
     def near(self, places: Float, reach: Float, *, include: bool = True) -> Index:
         """Return the positions in :attr:`cells` of the cells within ``reach`` (P,) of ``places`` (P, 2).
 
-        If ``include`` is true, the effects of loads on these cells are computed unless they are known.
+        If ``include`` is true, the effects of loads on these cells are computed unless they are already
+        known.
         """
         square = ((self._place[:, None] - places) ** 2).sum(axis=-1)
         near = np.flatnonzero((square <= np.minimum(reach, FARTHEST) ** 2).any(axis=1))

@@ -1,11 +1,11 @@
 """Compiled part of the filter over frames: interacting multiple models (IMM) of a moving skin.
 
 Each mode of the readings (:mod:`skinnode.solve.posterior.past.load_modes`) is the state of a scalar Kalman
-filter. The filters of all modes form a bank for each speed τ of the skin: from one frame to the next, a mode
-with the share λ changes by a random step of variance τ λ. The unit is the noise variance of a reading, so τ
-is the mean square of the change in all readings together. The last bank forgets all earlier frames: its state
-is the current frame. Its likelihood is averaged over several large speeds and a change in all readings that
-no loads explain.
+filter. For each speed τ of the skin, the filters of all modes form a bank: from one frame to the next, a mode
+with share λ changes by a random step of variance τ λ. The unit is the noise variance of a reading, so τ is
+the mean squared change of all readings taken together. The last bank forgets all earlier frames: its state is
+the current frame. Its likelihood is averaged over several high speeds and over a change in all readings that
+no loads can explain.
 
 The probabilities of the banks follow from the likelihoods of their predictions (Blom and Bar-Shalom, The
 interacting multiple model algorithm for systems with Markovian switching coefficients, 1988). Before each
@@ -30,7 +30,7 @@ followed a change of 7 standard deviations only halfway in the first frame."""
 JUMPS: Final = np.array([3.0, 30.0, 300.0, 3000.0, 300.0])
 """Speeds τ of the bank that forgets all earlier frames."""
 UNEXPLAINED: Final = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
-"""Variance of the change in each reading that no loads explain, for each of :data:`JUMPS`."""
+"""Variance, per reading, of the change that no loads can explain, for each of :data:`JUMPS`."""
 STAYS: Final = 0.9
 """Probability per frame that the skin keeps its speed."""
 JUMPS_CHANCE: Final = 0.03
@@ -209,7 +209,7 @@ def _add(mean: float, variance: float, mode: Float, filtered: Float, noise: Floa
 
 @njit
 def filter_frame(table: NDArray[np.int64], least: float) -> float:
-    """Filter a frame; return the probability that the skin jumped, which invalidates earlier frames.
+    """Filter a frame; return the probability that the skin jumped, in which case earlier frames are invalid.
 
     Args:
         table: Table of :class:`FilterArrays`.

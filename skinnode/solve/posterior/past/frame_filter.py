@@ -1,7 +1,7 @@
 """Filter over the frames of one patch: replaces a frame's readings with estimates from several frames.
 
-The filter works on the logarithms of the readings, before the posterior solves them. It returns readings with
-less noise, which the posterior solves like those of a single frame. If noise cannot explain a change in the
+The filter works on the logarithms of the readings, before the posterior solve. It returns readings with less
+noise, which the posterior treats like those of a single frame. If noise cannot explain a change in the
 readings, the filter forgets all earlier frames immediately, and the frame is solved unfiltered.
 
 The state before a frame is kept until the next frame. If the data check finds wrong readings, both the filter
@@ -30,10 +30,10 @@ from skinnode.solve.posterior.past.load_modes import LoadModes
 
 NOISY: Final = 0.9e-4
 """Minimum relative noise of the readings (RMS) for the filter to be used. It is slightly below 1e-4, so that
-a noise level of 1e-4 is filtered even if its estimate is a little lower."""
+readings with a noise of 1e-4 are filtered even if the estimated noise is a little lower."""
 LEAST_NOISE: Final = 2.5e-5
-"""Minimum noise of the filtered readings. With less noise, errors of the forward model that the stated noise
-covers would make correct readings contradict each other."""
+"""Minimum noise of the filtered readings. With less noise, forward-model errors that the stated noise covers
+would make correct readings contradict each other."""
 MOST_FRAMES: Final = 64.0
 """Maximum number of frames averaged."""
 LEAST_READINGS: Final = 12

@@ -24,7 +24,8 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Minimum time (s) before the first press. The baseline of the untouched skin is measured during it."""
+"""Minimum time (s) before the first press. During this time, the baseline of the untouched skin is
+measured."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Durations of pressing, sliding and lifting, as fractions of a cycle. For the rest of the cycle, the skin is

@@ -47,7 +47,8 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""Scenes as triples: True for CAN FD, True for touched patches, and the offset between SYNCs in ms."""
+"""Scenes as triples: whether CAN FD is used, whether the patches are touched, and the offset between SYNCs in
+ms."""
 DEADLINE_US: Final = 1000
 """Deadline for solving a scan, in µs. For comparison, an exact inverse takes 200 µs, and its verification by
 the posterior 13 ms."""

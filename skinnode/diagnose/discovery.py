@@ -80,7 +80,8 @@ class FoundNode:
     duplicate: str
     """Evidence that two nodes have this node-ID; empty if there is none."""
     wrong_answer: str = ""
-    """Newest invalid SDO response in hexadecimal; empty if there was a valid response or none at all."""
+    """Newest invalid SDO response in hexadecimal; empty if there was a valid response or no response at
+    all."""
 
     @property
     def profile(self) -> str:

@@ -25,7 +25,8 @@ from skinnode.process import clock
 from skinnode.process.closing import Closing
 
 LATE: Final = "late"
-"""Reason for a missing field: the patch is operational, but its field missed the deadline or the end."""
+"""Reason for a missing field: the patch is operational, but its field did not arrive before the deadline or
+the end."""
 OVERTAKEN: Final = "overtaken"
 """Reason for a missing field: the patch has already delivered the field of a newer scan."""
 

@@ -94,7 +94,8 @@ class PatchHealth:
     5 s ago.
     """
     duplicate_id: bool = False
-    """Whether two nodes seem to share the node-ID: heartbeats arrive more often than one node sends them."""
+    """Whether two nodes seem to share the node-ID: heartbeats arrive more often than one node would send
+    them."""
     conflicts: int = 0
     """Number of frames that contradict another frame of the same scan. The cause may be a wrong counter in
     the node, or two nodes with the same node-ID.

@@ -15,7 +15,8 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval (s) between health checks. A change shorter than this interval may appear only in the counters."""
+"""Interval (s) between health checks. A change that lasts less than this interval may appear only in the
+counters."""
 
 _QUIET_NS: Final = 1_000_000_000
 """Minimum interval (ns) between events for the same counter."""

@@ -20,7 +20,8 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Minimum time limit (s) from the start command to the first heartbeat that reports operational."""
+"""Minimum time limit (s) from the start command to the first heartbeat that reports the node as
+operational."""
 
 START_HEARTBEATS: Final = 4
 """Minimum length of this time limit, in heartbeat periods."""

@@ -61,7 +61,8 @@ class StreamStats:
     untrusted: int
     """Number of untrusted fields."""
     invalid_codes: int
-    """Number of codes in all solved scans that mark a crossing as over range, shorted, open or missing."""
+    """Number of codes, over all solved scans, that mark a crossing as over range, shorted, open or
+    missing."""
     assembler: AssemblerStats
     failed: int = 0
     """Number of scans whose decoding or solving raised an exception."""

@@ -29,7 +29,8 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Maximum number of attempts for a transfer that gets no response, or the response to an earlier transfer."""
+"""Maximum number of attempts for a transfer that gets either no response or the response to an earlier
+transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
 """canopen's error messages for a missing response. The second occurs after canopen's own retransmission

@@ -22,7 +22,8 @@ class Scan:
     counter: int
     """Scan counter, as sent on the bus."""
     scan: int
-    """Scan counter without wrap-around. It starts at the first counter received and increases."""
+    """Scan counter without wrap-around. It starts at the first counter value received and keeps
+    increasing."""
     complete: bool
     """Whether the codes are known to match the codes that the node packed: all chunks arrived or are known to
     be unchanged, and, in a checked stream, the check passed."""

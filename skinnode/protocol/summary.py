@@ -29,7 +29,8 @@ class SummaryFlag(enum.IntFlag):
     WIRE_FAULT = 0x04
     """At least one wire is open or shorted; see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
-    """This scan is the first with a new baseline. The host must read 0x2200 and above again."""
+    """This scan is the first with a new baseline. The host must read the objects at 0x2200 and above
+    again."""
     SOURCE_FAILED = 0x10
     """The converter returned no valid reading. No chunks were sent, and the codes are unknown."""
     CHECKED = 0x20

@@ -72,7 +72,8 @@ _MOST: Final = 2**63 - 1
 _MOST_SYNCS: Final = 2**53
 """Maximum accepted SYNC number, chosen so that the numbers of later SYNCs also fit in 64 bits."""
 _LONGEST_HEADER: Final = 32 << 20
-"""Maximum length of the first line in bytes. The layout files of a hundred of the largest patches fit."""
+"""Maximum length of the first line in bytes. Long enough for the layout files of a hundred of the largest
+patches."""
 _LONGEST_LINE: Final = 2 << 20
 """Maximum length of a line in bytes. Long enough for an event containing the baseline and layout of the
 largest patch; a longer line is read as several lines."""

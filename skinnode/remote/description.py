@@ -36,7 +36,8 @@ class Description:
     hand: HandConfig
     """Configuration of the hand, without file names; programs always receive ``guest_sends`` as ``sdo``."""
     layouts: Mapping[str, PatchLayout]
-    """Electrode layout of each patch, by patch name; as planned until its node has supplied its own."""
+    """Electrode layout of each patch, by patch name; the planned layout until the node has supplied its
+    own."""
     boot_id: str
     """Boot ID of the daemon's operating system. Processes with the same boot ID share a monotonic clock."""
     commands: bool

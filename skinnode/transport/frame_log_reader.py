@@ -28,7 +28,8 @@ from skinnode.transport.frame_log import WRITABLE, LoggedFrame
 READABLE: Final = WRITABLE
 """Suffixes of logs that can be read."""
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damaged parts that are described. Further damaged parts are only counted."""
+"""Maximum number of damaged parts that are described. Any further damaged parts are counted but not
+described."""
 
 
 @dataclass(frozen=True, slots=True)

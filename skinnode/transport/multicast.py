@@ -83,7 +83,8 @@ _MOST_KINDS: Final = 4096
 """Maximum number of packet kinds to remember. Sixteen patches send 100 kinds."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible lead of a frame's timestamp over the time at which the frame is read, in ns."""
+"""Maximum time, in ns, by which a frame's timestamp can plausibly be later than the time at which the frame
+is read."""
 
 
 class _Kind(NamedTuple):

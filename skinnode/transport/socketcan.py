@@ -45,7 +45,8 @@ timestamps."""
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum plausible lead (ns) of a frame's timestamp over the time at which the frame is read."""
+"""Maximum time (ns) by which a frame's timestamp can plausibly be later than the time at which the frame is
+read."""
 
 _IP_S: Final = 5.0
 """Maximum duration (s) of an ``ip`` command."""

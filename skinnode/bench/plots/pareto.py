@@ -17,7 +17,8 @@ MARKS: Final = {
 }
 """Label, colour and marker of each method."""
 SIZES: Final = {method: 55 if "past" in method else 140 for method in METHODS}
-"""Size of each method's mark: if earlier frames change nothing, both marks of a prior remain visible."""
+"""Marker size of each method; both markers of a prior remain visible even if earlier frames change
+nothing."""
 TITLES: Final = {"held": "body held still", "moving": "body moving"}
 ASKED: Final = (0.92, 0.98)
 """Coverage range that is shaded."""

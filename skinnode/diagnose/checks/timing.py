@@ -15,7 +15,8 @@ _JITTER: Final = 0.1
 
 _PERIOD_ERROR: Final = 0.02
 _LATE: Final = 0.95
-"""Time from SYNC to the end of a scan above which scans are reported as late, as a fraction of the period."""
+"""Time from SYNC to the end of a scan, as a fraction of the period, above which scans are reported as
+late."""
 
 
 def check_timing(bus: BusFacts) -> Iterator[Finding]:

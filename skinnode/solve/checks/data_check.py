@@ -39,7 +39,8 @@ SUSPICIOUS: Final = 5.0
 """Gain in log evidence from assuming a fault, in nats, above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 EXCUSED: Final = 10.0
-"""Excess gain (nats) over an examined frame below which a frame is considered similar to it."""
+"""Amount (nats) by which a frame's gain may exceed that of an examined frame for the two to be considered
+similar."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames for which the result of an examination also applies to similar frames. An examination
 takes about as long as solving and testing two other frames."""

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import socket
 import subprocess
-import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
-PROGRAM = "from skinnode.cli.main import main; main()"
+from tests.commands import run_here
 
 
-def run(*arguments: str, code: str = PROGRAM, **variables: str) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     kept = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-c", code, "view", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60.0,
-        stdin=subprocess.DEVNULL,
-        env={**kept, **variables},
-    )
+    with mock.patch.dict(os.environ, {**kept, **variables}, clear=True):
+        return run_here("view", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -93,10 +88,12 @@ def test_a_port_in_use_is_one_line(sdk: None) -> None:
             )
 
 
-def test_without_the_sdk_one_line_says_what_to_install() -> None:
-    hidden = "import importlib.util as u; found = u.find_spec\n"
-    hidden += "u.find_spec = lambda name, *more: None if name == 'rerun' else found(name, *more)\n"
-    done = run("--simulate", code=hidden + PROGRAM)
+def test_without_the_sdk_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name == "rerun" else found(name, *more)
+    )
+    done = run("--simulate")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         "error: skinnode view: got no package rerun-sdk, "

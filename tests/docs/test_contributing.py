@@ -42,7 +42,7 @@ def test_users_of_the_simulator_are_those_of_the_contract() -> None:
         line.split(" -> ")[0].replace(".", "/") + ".py"
         for line in contract("does not know")["ignore_imports"]
     }
-    sentence = re.split(r"in\s+these\s+files\s+only:", TEXT)[1].split("\n\n")[0]
+    sentence = re.split(r"only\s+in\s+these\s+files:", TEXT)[1].split("\n\n")[0]
     named = {
         str(path.relative_to(ROOT))
         for pattern in re.findall(r"`([\w/*.]+)`", sentence)

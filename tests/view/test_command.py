@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import socket
 import subprocess
@@ -11,6 +10,7 @@ from unittest import mock
 
 import pytest
 
+from skinnode.view import viewer_process
 from tests.commands import run_here
 
 
@@ -89,10 +89,7 @@ def test_a_port_in_use_is_one_line(sdk: None) -> None:
 
 
 def test_without_the_sdk_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *more: None if name == "rerun" else found(name, *more)
-    )
+    monkeypatch.setattr(viewer_process, "find_spec", lambda name: None)
     done = run("--simulate")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (

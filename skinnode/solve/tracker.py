@@ -265,6 +265,8 @@ class Tracker:
         self._last_ns = now
         if now is not None and last is not None and not 0 <= now - last <= self._gap_ns:
             self._posterior.forget_past()
+            if self._contacts is not None:
+                self._contacts.forget()
             if self._skew is not None:
                 self._skew.reset()
 
@@ -281,6 +283,8 @@ class Tracker:
             return None
         check.pass_frame()
         self._posterior.forget_past()  # the next touch need not resemble the last
+        if self._contacts is not None:
+            self._contacts.forget()
         stated = noise
         if stated is None:
             stated = self._stated if codes is None else self._stated_of_codes

@@ -283,7 +283,11 @@ class Explainer:
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
         starts = {number: float(evidence[number]) + extra(model.level(number)) for number in _scales(best)}
         half_chi2 = -evidence - 0.5 * model.log_det  # loads can gain no more than this
-        hopeful = [number for number in starts if starts[number] + half_chi2[number] >= needed]
+        hopeful = [
+            number
+            for number in starts
+            if starts[number] + half_chi2[number] >= needed or not self._search.is_bounded(number)
+        ]
         if not hopeful:
             return -math.inf
         return max(

@@ -102,6 +102,8 @@ class GreedySearch:
             needed: Gain that is of interest, in nats.
         """
         self.kinds[:] = -1
+        if not self.is_bounded(number):
+            needed = -math.inf
         if 0.5 * float(z.ravel() @ products[: z.size]) + self._slack(number, cost, faults) < needed:
             return -math.inf
         (m, count), (upper, lower) = self._model.response.shape, self._model.shape
@@ -122,6 +124,14 @@ class GreedySearch:
             weighted, diagonal, vectors, share, of_upper, of_lower, block, right, items, applied,
             self.kinds, self.numbers, self.gains,
         )  # fmt: skip
+
+    def is_bounded(self, number: int) -> bool:
+        """Return whether the gain of a search at κ number ``number`` is at most ½ χ² plus the slack.
+
+        Loads whose diagonal element of E is below :data:`LEAST` are added with too small a variance, and can
+        be credited again. This happens at large κ.
+        """
+        return bool(self._model.loads(number).diagonal[len(self._model.response) :].min() >= LEAST)
 
     def _slack(self, number: int, cost: float, faults: bool) -> float:
         """Return an upper bound on ½ ln det S_GG − cost · |G| over all sets G of readings; 0 without faults.

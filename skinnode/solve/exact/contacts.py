@@ -75,8 +75,12 @@ class ExactContacts:
         """Discard the state of the stream."""
         self._finder.reset()
         self._fit.reset()
-        self._force, self._contacts, self._known = self.no_force_n, self._no_contacts, False
+        self.forget()
         self._interrupted = 0  # number of successive fields that the deadline interrupted
+
+    def forget(self) -> None:
+        """Forget the contacts of the previous field, so that an interrupted field does not repeat them."""
+        self._force, self._contacts, self._known = self.no_force_n, self._no_contacts, False
 
     def add(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its contacts and, unless the ``stiffness_n_per_m`` option is set, its forces.

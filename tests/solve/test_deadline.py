@@ -179,3 +179,25 @@ class TestDeadline:
         (contact,) = after.contacts
         assert after.trusted
         assert contact.normal_force_n != kept.normal_force_n
+
+    @pytest.mark.parametrize("between", ["gap", "rest"])
+    def test_contacts_do_not_survive_a_gap_nor_a_time_at_rest(
+        self, staggered, rest, stream, monkeypatch, between
+    ):
+        tracker = sk.Tracker(staggered, relative_noise=1e-5, deadline_us=50.0, method="exact")
+        clock = Clock(monkeypatch, 0.0)
+        tracker.t_ns = 0
+        for _, frame in stream[:12]:
+            tracker.t_ns += 80_000_000
+            assert tracker.update(frame).trusted
+        if between == "gap":
+            tracker.t_ns += 60_000_000_000
+        else:
+            for _ in range(8):
+                tracker.t_ns += 80_000_000
+                tracker.update(rest)
+        clock.call_s = 20e-6
+        tracker.t_ns += 80_000_000
+        field = tracker.update(stream[36][1])
+        assert sk.Status.DEADLINE in field.status
+        assert field.contacts == ()

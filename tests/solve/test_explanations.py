@@ -12,8 +12,6 @@ from skinnode.solve.checks.explanations import CLEAR, Explainer
 from skinnode.solve.checks.greedy_search import GreedySearch
 from skinnode.solve.checks.reading_model import ReadingModel, evidences
 
-SIGMA = 1e-5
-COST = math.log(0.1 / SIGMA)
 KINDS = ("healthy", "reading", "upper", "lower", "gain", "crossed", "noisy", "missing")
 
 
@@ -29,15 +27,14 @@ class Thorough(GreedySearch):
         return super().run(*args, **options)
 
 
-def frame(model, kind, seed):
+def frame(model, kind, sigma, seed):
     """Changes (U, K) of the readings under a press, in units of their noise, and which are available."""
     random = np.random.default_rng(seed)
     cells = model.response.shape[1] // 4  # three loads of the half-space a cell, then one of the thin layer
     loads = np.zeros(model.response.shape[1])
     near = random.integers(0, cells) + np.arange(-1, 2)
-    loads[3 * np.clip(near, 0, cells - 1) + 2] = (
-        random.uniform(0.3, 1.0) * 10.0 ** random.uniform(-4, -2) / SIGMA
-    )
+    depth = random.uniform(0.3, 1.0) * 10.0 ** random.uniform(-4, -0.2)
+    loads[3 * np.clip(near, 0, cells - 1) + 2] = depth / sigma
     z = (model.response @ loads + random.standard_normal(len(model.response))).reshape(model.shape)
     present = np.ones(model.shape, bool)
     upper, lower = (int(random.integers(0, size - 1)) for size in model.shape)
@@ -59,16 +56,18 @@ def frame(model, kind, seed):
     return z, present
 
 
+@pytest.mark.parametrize("sigma", [1e-5, 1e-6])
 @pytest.mark.parametrize("kind", KINDS)
-def test_decisions_do_not_depend_on_stopping_early(model, kind):
+def test_decisions_do_not_depend_on_stopping_early(model, kind, sigma):
+    """At little noise and deep presses, loads are nearly free, and the bounds of the searches do not hold."""
     quick, thorough = Explainer(model), Explainer(model)
     thorough._search = Thorough(model)
     found = 0
     for seed in range(20):
-        z, present = frame(model, kind, seed)
+        z, present = frame(model, kind, sigma, seed)
         evidence, scratch = np.empty(len(model.kappa)), np.empty((2, z.size))
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
-        arguments = present, evidence, best, COST, SIGMA
+        arguments = present, evidence, best, math.log(0.1 / sigma), sigma
         groups = quick.wrong_readings(z.copy(), *arguments)
         expected = thorough.wrong_readings(z.copy(), *arguments)
         assert [(each.part, each.upper, each.lower, each.kind) for each in groups] == [
@@ -79,4 +78,5 @@ def test_decisions_do_not_depend_on_stopping_early(model, kind):
         if thorough.margin >= CLEAR:
             assert quick.margin == pytest.approx(thorough.margin, abs=1e-6)
         found += bool(groups)
-    assert found > 5 if kind in {"reading", "lower", "gain"} else found < 20
+    if kind in {"reading", "lower", "gain"}:
+        assert found > 1

@@ -12,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable
-    from contextlib import ExitStack
+    from contextlib import AbstractContextManager, ExitStack
 
     from skinnode.cli._zenoh_options import ZenohOptions
     from skinnode.config import HandConfig
@@ -36,6 +36,12 @@ Simulate = Annotated[
         help="Simulate pressed patches on a private bus: the hand's patches, or four without a hand.",
     ),
 ]
+Scene = Annotated[
+    Path | None,
+    typer.Option(
+        help="Scene that --simulate plays: a file, or a name from `vcan-sim list`.", metavar="SCENE.toml"
+    ),
+]
 Remote = Annotated[
     str | None,
     typer.Option(help="Show the hand of this name that `skinnode host --publish` publishes.", metavar="NAME"),
@@ -51,6 +57,7 @@ class WatchOptions(NamedTuple):
     replay: Path | None
     speed: float | None
     simulate: bool
+    scene: Path | None
     remote: str | None
     zenoh: ZenohOptions
 
@@ -83,6 +90,8 @@ def check_options(options: WatchOptions) -> None:
         raise ConfigError(key, got, "one of HAND.toml, --simulate, --replay RECORDING and --remote NAME")
     if options.speed is not None and options.replay is None:
         raise ConfigError("--speed", options.speed, "only with --replay")
+    if options.scene is not None and not options.simulate:
+        raise ConfigError("--scene", str(options.scene), "only with --simulate")
     if options.remote is None:
         options.zenoh.require_unused("only with --remote")
     unused = "--simulate" if options.simulate else given[0] if options.hand is None else None
@@ -151,9 +160,10 @@ def _host(options: WatchOptions) -> WatchedSource:
     from skinnode.process import clock
 
     plan = _plan(options)
+    simulation = _simulation(options, plan)
 
     def start(stack: ExitStack, stop: threading.Event, tell: Callable[[str], None]) -> Source:
-        return _running(stack, plan, stop, simulate=options.simulate, tell=tell)
+        return _running(stack, plan, stop, simulation, tell)
 
     return WatchedSource(plan, plan.name, clock.time_ns() - clock.monotonic_ns(), start)
 
@@ -178,12 +188,24 @@ def _plan(options: WatchOptions) -> HandConfig:
     return plan.model_copy(update={"bring_up": waiting})
 
 
+def _simulation(options: WatchOptions, plan: HandConfig) -> Callable[[], AbstractContextManager[None]] | None:
+    """Return a function that simulates the hand's patches; None if they are not simulated.
+
+    The scene is loaded now, so that an error in it is reported before anything is opened or shown.
+    """
+    if not options.simulate:
+        return None
+    from skinnode.demo.simulated import scene_of, simulated
+
+    scene = None if options.scene is None else scene_of(options.scene, plan)
+    return lambda: simulated(plan, scene)
+
+
 def _running(
     stack: ExitStack,
     plan: HandConfig,
     stop: threading.Event,
-    *,
-    simulate: bool,
+    simulation: Callable[[], AbstractContextManager[None]] | None,
     tell: Callable[[str], None],
 ) -> Source:
     """Start a host and return its source; see :class:`WatchedSource`."""
@@ -197,10 +219,8 @@ def _running(
     tell("compiling the kernels once" if is_cold() else "preparing the solvers")
     for patch in plan.patches:
         check_solvable(patch, plan.solver, plan.sync.period_s)
-    if simulate:
-        from skinnode.demo.simulated import simulated
-
-        stack.enter_context(simulated(plan))
+    if simulation is not None:
+        stack.enter_context(simulation())
     tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
     stack.enter_context(responsive_threads())
     stack.enter_context(without_long_collections())  # collects garbage now, before the first SYNC

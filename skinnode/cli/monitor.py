@@ -15,6 +15,7 @@ from skinnode.cli._options import OtherChannel, OtherInterface
 from skinnode.cli._watched_hand import (
     Remote,
     Replayed,
+    Scene,
     Simulate,
     Speed,
     WatchedHand,
@@ -37,6 +38,7 @@ def monitor(
     replay: Replayed = None,
     speed: Speed = None,
     simulate: Simulate = False,
+    scene: Scene = None,
     remote: Remote = None,
     router: Router = None,
     zenoh_config: ZenohConfig = None,
@@ -69,7 +71,7 @@ def monitor(
     if not as_json:
         _require_screen()
     zenoh = ZenohOptions(router, zenoh_config, zenoh_port)
-    options = WatchOptions(hand, interface, channel, replay, speed, simulate, remote, zenoh)
+    options = WatchOptions(hand, interface, channel, replay, speed, simulate, scene, remote, zenoh)
     check_options(options)
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise ConfigError("--output", output, "a folder name; the first recording creates the folder")

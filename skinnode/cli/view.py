@@ -13,6 +13,7 @@ from skinnode.cli._options import OtherChannel, OtherInterface, Seconds
 from skinnode.cli._watched_hand import (
     Remote,
     Replayed,
+    Scene,
     Simulate,
     Speed,
     WatchedHand,
@@ -55,6 +56,7 @@ def view(
     replay: Replayed = None,
     speed: Speed = None,
     simulate: Simulate = False,
+    scene: Scene = None,
     remote: Remote = None,
     router: Router = None,
     zenoh_config: ZenohConfig = None,
@@ -105,7 +107,7 @@ def view(
 
     _require_viewer()
     zenoh = ZenohOptions(router, zenoh_config, zenoh_port)
-    options = WatchOptions(hand, interface, channel, replay, speed, simulate, remote, zenoh)
+    options = WatchOptions(hand, interface, channel, replay, speed, simulate, scene, remote, zenoh)
     check_options(options)
     for option, value in (("--address", address), ("--port", port)):
         if value is not None and not web:

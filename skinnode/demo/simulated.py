@@ -11,11 +11,16 @@ import random
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from skinnode.config import HandConfig
 from skinnode.config.patches import TolerancesConfig
 from skinnode.errors import SkinError
 from skinnode.process.child_processes import starting_children
+
+if TYPE_CHECKING:
+    from vcan_sim.scenes import SceneConfig
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
@@ -41,18 +46,38 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
     return hand.model_copy(update={"buses": buses, "patches": patches})
 
 
+def scene_of(scene: Path, hand: HandConfig) -> SceneConfig:
+    """Load a scene for :func:`simulated`.
+
+    Args:
+        scene: Path of the file, or name of a shipped scene.
+        hand: The hand on which the scene is played.
+
+    Raises:
+        ConfigError: The scene cannot be read, or does not fit the hand.
+    """
+    from vcan_sim.scenes import load_scene
+    from vcan_sim.scenes.library import scene_file
+
+    return load_scene(scene_file(scene), hand)
+
+
 @contextmanager
-def simulated(hand: HandConfig) -> Iterator[None]:
+def simulated(hand: HandConfig, scene: SceneConfig | None = None) -> Iterator[None]:
     """Simulate the patches of a hand in a child process during the ``with`` block.
 
     The child process exits even if this process is killed.
+
+    Args:
+        hand: The hand to simulate.
+        scene: Scene to play; None for a sphere that presses on each patch.
 
     Raises:
         SkinError: The child process cannot run the patches.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_run_nodes, args=(hand, theirs), name="simulated patches")
+    process = context.Process(target=_run_nodes, args=(hand, scene, theirs), name="simulated patches")
     with starting_children():
         process.start()
     theirs.close()
@@ -69,7 +94,7 @@ def simulated(hand: HandConfig) -> Iterator[None]:
         process.join()
 
 
-def _run_nodes(hand: HandConfig, parent: Connection) -> None:
+def _run_nodes(hand: HandConfig, scene: SceneConfig | None, parent: Connection) -> None:
     """Run the nodes until the parent process closes its end of the pipe or exits."""
     import signal
 
@@ -77,7 +102,7 @@ def _run_nodes(hand: HandConfig, parent: Connection) -> None:
 
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent also receives SIGTERM and closes the pipe
     try:
-        with Fleet(hand):
+        with Fleet(hand, scene=scene):
             parent.send("")
             with suppress(EOFError, OSError):
                 parent.recv()

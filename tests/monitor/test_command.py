@@ -98,6 +98,7 @@ def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
         (["--json", "--replay", "/nowhere.log"], "nowhere"),
         (["--json", "--replay", "/x.log", "--interface", "pcan"], "--interface: got 'pcan', allowed: only"),
         (["--json", "--simulate", "--channel", "can1"], "--channel: got 'can1', allowed: only without"),
+        (["--json", "--simulate", "--scene", "/nowhere.toml"], "/nowhere.toml"),
         (["--json", "--simulate", "--speed", "2"], "--speed: got 2.0, allowed: only with --replay"),
     ],
 )
@@ -123,3 +124,17 @@ def test_simulated_patches_are_a_hand_to_begin_with() -> None:
     newest = json.loads(done.stdout.splitlines()[-1])
     assert set(newest["patches"]) == {"palm", "thumb", "index", "middle"}
     assert all(patch["rate_hz"] > 0 for patch in newest["patches"].values()), done.stderr
+
+
+@pytest.mark.real_time
+def test_the_simulated_patches_play_a_scene(tmp_path: Path) -> None:
+    """Without a scene, a sphere presses on each patch."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        'bodies = [{ name = "ball", shape = "sphere", radius_m = 0.01 }]\n'
+        '[[touches]]\nbody = "ball"\npatch = "thumb"\nat_m = [0.016, 0.016]\n'
+        "force_n = 2.0\nfrom_s = 0.1\nto_s = 60.0\n"
+    )
+    done = run("--simulate", "--scene", str(scene), "--json", "--seconds", "5")
+    newest = json.loads(done.stdout.splitlines()[-1])["patches"]
+    assert {name for name, patch in newest.items() if patch["touches"]} == {"thumb"}, done.stderr

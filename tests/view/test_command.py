@@ -39,6 +39,14 @@ def run(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
         (["--replay", "/nowhere.log", "--save", "x.rrd", "--rate", "2"], "--rate: got 2.0, allowed: with"),
         (["--simulate", "--speed", "2", "--web"], "--speed: got 2.0, allowed: only with --replay"),
         (["--simulate", "--channel", "can1", "--web"], "--channel: got 'can1', allowed: only without"),
+        (
+            ["/nowhere.toml", "--scene", "press", "--web"],
+            "--scene: got 'press', allowed: only with --simulate",
+        ),
+        (
+            ["--simulate", "--scene", "nothing", "--web"],
+            "--scene: got 'nothing', allowed: a scene file, or one",
+        ),
         (["--simulate", "--port", "9000"], "--port: got 9000, allowed: only with --web"),
         (["--simulate", "--address", "0.0.0.0"], "--address: got '0.0.0.0', allowed: only with --web"),
         (["--simulate", "--web", "--address", "nowhere at all"], "port: got 'nowhere at all:9090', allowed"),

@@ -9,6 +9,8 @@ import sys
 import threading
 import time
 
+import pytest
+
 from skinnode.process.signals import SignalEvent
 
 PROGRAM = """
@@ -32,6 +34,7 @@ print("ended")
 """
 
 
+@pytest.mark.long
 def test_no_instant_of_a_signal_stops_the_program_for_good() -> None:
     """With the lock of threading.Event, a signal soon came while the main thread held it."""
     ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60)

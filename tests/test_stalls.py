@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.lanes import some_long
+
 ROOT = Path(__file__).parent.parent
 MODULE = """
 import ctypes
@@ -59,7 +61,9 @@ def run(folder: Path, *options: str, fails_in_setup: bool = False, third: bool =
 
 
 @pytest.mark.parametrize(
-    ("workers", "fails_in_setup"), [(0, True), (2, False)], ids=["in a fixture", "in a worker"]
+    ("workers", "fails_in_setup"),
+    some_long([(0, True), (2, False)], (2, False)),
+    ids=["in a fixture", "in a worker"],
 )
 def test_it_runs_again_with_new_fixtures(tmp_path: Path, workers: int, fails_in_setup: bool) -> None:
     options = ["-n", str(workers), "--dist", "loadfile"]

@@ -63,6 +63,7 @@ def test_in_noise_discs_and_earlier_frames_reduce_the_error_of_a_held_body(figur
     assert all(row["ms"] > 0.0 for row in figures["pareto"])
 
 
+@pytest.mark.long
 def test_the_table_has_a_line_for_each_method_and_motion(folder, figures):
     printed = (folder / "printed.txt").read_text()
     for row in figures["pareto"]:

@@ -41,6 +41,7 @@ def test_every_cell_of_table_3_is_bettered(outcome):
         assert "more accurate than the paper: 15 of 15" in output
 
 
+@pytest.mark.long
 def test_whatever_fails_is_said_to_and_is_not_wrong(outcome):
     output, figures, _ = outcome
     for setting in figures["settings"]:
@@ -50,6 +51,7 @@ def test_whatever_fails_is_said_to_and_is_not_wrong(outcome):
     assert "Wires CONVERGED but wrong, over all settings and schedules: 0" in output
 
 
+@pytest.mark.long
 def test_more_samples_take_fewer_calls_a_step_and_ours_fewer_than_plain(outcome):
     _, figures, _ = outcome
     setting = figures["settings"][0]
@@ -60,6 +62,7 @@ def test_more_samples_take_fewer_calls_a_step_and_ours_fewer_than_plain(outcome)
     assert len(setting["figure8"]["20"]) == 19
 
 
+@pytest.mark.long
 def test_a_cycle_shows_at_the_relaxed_tolerance_only(outcome):
     _, figures, _ = outcome
     setting = figures["settings"][0]
@@ -72,6 +75,7 @@ def test_a_cycle_shows_at_the_relaxed_tolerance_only(outcome):
     assert setting["figure12"]["uniform"][-1] < 6.93e-11
 
 
+@pytest.mark.long
 def test_what_the_paper_prints_stands_beside(outcome):
     output, figures, _ = outcome
     assert figures["paper"]["table2_function_calls_per_step"]["dogleg"][1] == 220.29
@@ -79,6 +83,7 @@ def test_what_the_paper_prints_stands_beside(outcome):
         assert figure in output
 
 
+@pytest.mark.long
 def test_plot_is_drawn(outcome):
     image = outcome[2].read_bytes()
     assert image.startswith(b"\x89PNG")

@@ -10,6 +10,7 @@ import pytest
 from skinnode.bench import recording as bench
 
 
+@pytest.mark.long
 def test_a_block_is_the_traffic_of_a_full_bus(tmp_path: Path) -> None:
     block = bench.block_of(1, 1.0, tmp_path)
     assert len(block.fields) in (76, 80)  # four patches, twenty scans a second; the last may end later
@@ -18,6 +19,7 @@ def test_a_block_is_the_traffic_of_a_full_bus(tmp_path: Path) -> None:
     assert times_ns == sorted(times_ns)
 
 
+@pytest.mark.long
 def test_sizes_and_counts_are_those_of_the_files(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = []
     kept: dict[str, int] = {}

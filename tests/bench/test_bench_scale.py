@@ -18,6 +18,7 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.virtual_time import VirtualClock
 
 
+@pytest.mark.long
 def test_each_scan_of_each_patch_is_solved() -> None:
     row = scale.measure(patches=5, touched=2, scans=2)  # on two buses
     assert row["fields"] == 5 * 2

@@ -385,6 +385,7 @@ def test_an_interrupted_run_continues_where_it_stopped(monkeypatch, tmp_path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
 
 
+@pytest.mark.long
 def test_wires_found_to_be_exchanged_are_not_forgotten_under_a_deeper_press() -> None:
     """Loads on the border explain a deep press on two exchanged wires better than the exchange does."""
     setting = Setting("staggered", 0.5, 1e-5)

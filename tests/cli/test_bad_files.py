@@ -20,6 +20,7 @@ from skinnode.protocol.eds_files import eds_text
 from skinnode.protocol.profile import PatchProfile
 from skinnode.record.journal import read_journal
 from tests.commands import virtual_time
+from tests.lanes import some_long
 from vcan_sim.cli import main as simulate
 
 EDS = (
@@ -139,7 +140,7 @@ OPTIONS: dict[str, Callable[[str], list[str]]] = {
 }
 
 
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("option", some_long(OPTIONS, "hand check", "replay", "od --diff", "convert"))
 def test_a_file_that_is_none_is_one_line(
     option: str, bad: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -254,7 +255,7 @@ BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("name", some_long(BOMBS, "size.npz", "ints.toml"))
 def test_a_small_file_that_needs_much_memory_is_refused_before(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -289,7 +290,7 @@ def test_a_journal_is_not_read_beyond_its_first_line_if_that_is_none(tmp_path: P
     assert most < 30 << 20
 
 
-@pytest.mark.parametrize(("patches", "buses"), [(10_000, 1), (10_000, 64), (128, 1)])
+@pytest.mark.parametrize(("patches", "buses"), some_long([(10_000, 1), (10_000, 64), (128, 1)], (128, 1)))
 def test_more_patches_than_node_ids_are_refused_at_once(
     patches: int, buses: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

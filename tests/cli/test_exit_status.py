@@ -12,12 +12,13 @@ import sys
 import time
 import uuid
 from collections.abc import Iterator, Sequence
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 
 import pytest
 
 from skinnode.config import BusConfig, load_hand
+from tests.lanes import some_long
 from vcan_sim.fleet import Fleet
 
 from ..commands import SIGNALS, run_for_nobody, run_until_signal
@@ -102,10 +103,12 @@ def hand_text(interface: str, channel: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "modules"),
     [
-        (["skinnode", "scan"], ["typer", "can"]),
-        (["skinnode", "--help"], ["skinnode.cli._errors", "skinnode.cli.lss"]),
+        pytest.param(["skinnode", "scan"], ["typer", "can"], marks=pytest.mark.long),
+        pytest.param(
+            ["skinnode", "--help"], ["skinnode.cli._errors", "skinnode.cli.lss"], marks=pytest.mark.long
+        ),
         (["skinnode", "hand", "check", "hand.toml"], ["pydantic", "numpy", "numba"]),
-        (["vcan-sim", "hand.toml"], ["typer", "skinnode.node"]),
+        pytest.param(["vcan-sim", "hand.toml"], ["typer", "skinnode.node"], marks=pytest.mark.long),
     ],
     ids=lambda words: " ".join(words),
 )
@@ -160,10 +163,12 @@ IN_PROCESSES = [("record", signal.SIGHUP), ("monitor", signal.SIGTERM), ("node",
 :func:`test_every_signal_ends_what_runs_until_it_is_told` has every signal."""
 
 
-def marked(cases: list[tuple[str, int]]) -> Iterator[object]:
-    """The host and the monitor count the scans of another process or thread, in real time."""
+def marked(cases: list[tuple[str, int]], *plain: tuple[str, int]) -> Iterator[object]:
+    """The host and the monitor count the scans of another process or thread, in real time. Only the ``plain``
+    cases are part of a plain run."""
     for command, number in cases:
         marks = [pytest.mark.real_time] if command in ("host", "monitor") else []
+        marks += [] if (command, number) in plain else [pytest.mark.long]
         yield pytest.param(command, number, marks=marks)
 
 
@@ -172,7 +177,7 @@ def is_stall(err: str) -> bool:
     return re.fullmatch(r"((fault: thumb: |node 5 \().*\n)+", err) is not None
 
 
-@pytest.mark.parametrize(("command", "number"), list(marked(IN_PROCESSES)))
+@pytest.mark.parametrize(("command", "number"), list(marked(IN_PROCESSES, IN_PROCESSES[0])))
 def test_what_runs_until_it_is_told_has_done_its_work(
     folder: Path, multicast_group: str, command: str, number: int
 ) -> None:
@@ -193,7 +198,10 @@ def test_what_runs_until_it_is_told_has_done_its_work(
     assert (process.returncode, err) == (0, "")
 
 
-@pytest.mark.parametrize(("command", "number"), list(marked(list(product(UNTIL_TOLD, SIGNALS)))))
+@pytest.mark.parametrize(
+    ("command", "number"),
+    list(marked(list(product(UNTIL_TOLD, SIGNALS)), *zip(UNTIL_TOLD, cycle(SIGNALS), strict=False))),
+)
 def test_every_signal_ends_what_runs_until_it_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, number: int
 ) -> None:
@@ -238,7 +246,7 @@ WITH_AN_END = {
 
 @pytest.mark.parametrize(
     ("command", "number"),
-    [(command, SIGNALS[turn % 3]) for turn, command in enumerate(WITH_AN_END)],
+    some_long(zip(WITH_AN_END, cycle(SIGNALS), strict=False), ("demo", SIGNALS[0]), ("scan", SIGNALS[1])),
 )
 def test_what_has_an_end_did_not_come_to_it(
     folder: Path, command: str, number: int, multicast_group: str
@@ -287,7 +295,7 @@ main()
 
 @pytest.mark.parametrize(
     ("turn", "number"),
-    list(zip([1, 2, 3], SIGNALS, strict=True)),
+    some_long(list(zip([1, 2, 3], SIGNALS, strict=True)), (2, SIGNALS[1])),
     ids=["resource tracker", "first process", "second process"],
 )
 def test_a_signal_while_child_processes_start(tmp_path: Path, turn: int, number: int) -> None:
@@ -346,9 +354,9 @@ def test_a_second_one_does_not_matter(folder: Path) -> None:
     "arguments",
     [
         ["skinnode", "eds"],
-        ["skinnode", "scan", *BUS, "--json"],
-        ["skinnode", "record", "hand.toml", "-o", ".", "--listen"],
-        ["vcan-sim", "hand.toml"],
+        pytest.param(["skinnode", "scan", *BUS, "--json"], marks=pytest.mark.long),
+        pytest.param(["skinnode", "record", "hand.toml", "-o", ".", "--listen"], marks=pytest.mark.long),
+        pytest.param(["vcan-sim", "hand.toml"], marks=pytest.mark.long),
     ],
 )
 def test_who_reads_may_go(folder: Path, arguments: list[str]) -> None:

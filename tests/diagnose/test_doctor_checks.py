@@ -16,6 +16,7 @@ from skinnode.diagnose.collect_facts import collect_facts
 from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.model.layout import PatchLayout
 from skinnode.text.printable import printable
+from tests.lanes import some_long
 from vcan_sim.default_scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
@@ -188,8 +189,8 @@ def told_of(ratio: np.ndarray) -> set[str]:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-@pytest.mark.parametrize("cycle_s", [0.5, 1.0, 4.0])
-@pytest.mark.parametrize("depth", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("cycle_s", some_long([0.5, 1.0, 4.0], 1.0))
+@pytest.mark.parametrize("depth", some_long([0.02, 0.1, 0.5], 0.1, 0.5))
 def test_who_touches_the_skin_is_no_defect(layout: PatchLayout, cycle_s: float, depth: float) -> None:
     for seed, period_s in ((1, 0.08), (2, 0.08), (3, 0.08), (4, 0.025)):
         ratio = stroked(layout, seed, period_s, cycle_s=cycle_s, depth=depth)
@@ -199,8 +200,8 @@ def test_who_touches_the_skin_is_no_defect(layout: PatchLayout, cycle_s: float, 
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-@pytest.mark.parametrize("depth", [0.0, 0.1, 0.5])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("depth", some_long([0.0, 0.1, 0.5], 0.1))
+@pytest.mark.parametrize("seed", some_long([1, 2, 3], 1))
 def test_faults_are_found_while_somebody_touches_the_skin(
     layout: PatchLayout, depth: float, seed: int
 ) -> None:

@@ -22,6 +22,7 @@ from skinnode.host import Condition, Host
 from skinnode.process import clock
 from skinnode.process.clock import SystemClock
 from skinnode.transport import CanPort
+from tests.lanes import some_long
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
 from vcan_sim.virtual_time import VirtualClock
@@ -242,7 +243,11 @@ def running(nothing_left_running: None, module_clock: None) -> Iterator[Running]
         assert fleet.tally(patch.name).discrepancies() == []
 
 
-@pytest.mark.parametrize("wave", waves(), ids=lambda wave: ", ".join(each.name for each in wave))
+@pytest.mark.parametrize(
+    "wave",
+    [pytest.param(wave, marks=pytest.mark.long if i > 1 else []) for i, wave in enumerate(waves())],
+    ids=lambda wave: ", ".join(each.name for each in wave),
+)
 def test_patches_are_back_within_a_second(running: Running, wave: tuple[Attack, ...]) -> None:
     said = running.suffer(wave)
     running.fleet.inject(NO_FAULTS)
@@ -252,7 +257,7 @@ def test_patches_are_back_within_a_second(running: Running, wave: tuple[Attack, 
         assert "\n" not in said[name]
 
 
-@pytest.mark.parametrize("off_s", [0.05, 0.2, 1.5])
+@pytest.mark.parametrize("off_s", some_long([0.05, 0.2, 1.5], 1.5))
 def test_bus_off(running: Running, off_s: float) -> None:
     running.fleet.bus_off("can0", off=True)
     clock.sleep(off_s)
@@ -260,7 +265,7 @@ def test_bus_off(running: Running, off_s: float) -> None:
     running.assert_back()
 
 
-@pytest.mark.parametrize("command", [0x02, 0x80, 0x81, 0x82])
+@pytest.mark.parametrize("command", some_long([0x02, 0x80, 0x81, 0x82], 0x02, 0x81))
 def test_a_stranger_stops_or_resets_a_node(running: Running, command: int) -> None:
     with CanPort(running.host.hand.buses[0]) as stranger:
         stranger.send(0, bytes([command, 5]))

@@ -18,6 +18,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.codes import MISSING, CodeScale, encode
 from skinnode.protocol.scan import Scan
 from skinnode.protocol.summary import SummaryFlag
+from tests.lanes import some_long
 from vcan_sim.default_scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
@@ -200,7 +201,7 @@ def test_failed_source_is_not_frozen() -> None:
     assert not patch.watch.frozen
 
 
-@pytest.mark.parametrize("noise", [0.0, 3e-7, 2e-6, 3e-6, 1e-5])
+@pytest.mark.parametrize("noise", some_long([0.0, 3e-7, 2e-6, 3e-6, 1e-5], 3e-6))
 def test_no_false_alarm_at_rest_of_quiet_and_noisy_converters(noise: float) -> None:
     """Quiet ones keep their codes for thousands of scans, also after a touch that rubber creeps back from."""
     patch = Patch(noise)
@@ -269,7 +270,7 @@ def test_a_touch_is_neither_noise_nor_drift() -> None:
         assert patch.watch.wires == ()
 
 
-@pytest.mark.parametrize("radius_m", [None, 0.005, 0.04, 0.3])
+@pytest.mark.parametrize("radius_m", some_long([None, 0.005, 0.04, 0.3], 0.005))
 def test_nothing_is_wrong_with_a_patch_that_is_pressed_or_left_alone(
     radius_m: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

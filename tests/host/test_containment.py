@@ -28,6 +28,7 @@ from skinnode.protocol.assembler import ScanAssembler
 from skinnode.record import Recorder
 from skinnode.transport import CanPort, Frame
 from skinnode.transport.receiver import Intake, Receiver
+from tests.lanes import some_long
 
 from .conftest import SMALL, Rack, eventually
 from .test_roles import changed
@@ -147,7 +148,9 @@ OF_PATCH: list[tuple[type, str, Callable[[Any], bool], str]] = [
 
 
 @pytest.mark.parametrize(
-    ("owner", "name", "concerns", "doing"), OF_PATCH, ids=[f"{o.__name__}.{n}" for o, n, _, _ in OF_PATCH]
+    ("owner", "name", "concerns", "doing"),
+    some_long(OF_PATCH, OF_PATCH[0], OF_PATCH[-1]),
+    ids=[f"{o.__name__}.{n}" for o, n, _, _ in OF_PATCH],
 )
 def test_a_defect_in_serving_a_patch_costs_that_patch_while_it_lasts(
     hand: HandConfig,
@@ -245,7 +248,9 @@ OF_HOST: list[tuple[type, str, str, str]] = [
 
 
 @pytest.mark.parametrize(
-    ("owner", "name", "subject", "doing"), OF_HOST, ids=[f"{o.__name__}.{n}" for o, n, _, _ in OF_HOST]
+    ("owner", "name", "subject", "doing"),
+    some_long(OF_HOST, OF_HOST[0], OF_HOST[-1]),
+    ids=[f"{o.__name__}.{n}" for o, n, _, _ in OF_HOST],
 )
 def test_a_defect_in_serving_a_bus_or_the_host_is_over_when_it_is_over(
     hand: HandConfig,

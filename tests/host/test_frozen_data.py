@@ -16,6 +16,7 @@ from skinnode.host.publish import Subscription
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame
+from tests.lanes import some_long
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
 
@@ -104,7 +105,10 @@ def of_patch(field: FieldFrame) -> list[DataFault]:
 
 @pytest.mark.parametrize(
     ("noise", "faults", "within"),
-    [(3e-6, Faults(frozen=True), 1), (1e-4, Faults(frozen=True, uncounted=True), 6)],
+    [
+        (3e-6, Faults(frozen=True), 1),
+        pytest.param(1e-4, Faults(frozen=True, uncounted=True), 6, marks=pytest.mark.long),
+    ],
 )
 def test_patch_frozen_in_mid_press_is_never_trusted(road, noise: float, faults: Faults, within: int) -> None:
     before = Faults(uncounted=faults.uncounted)
@@ -132,12 +136,14 @@ def test_patch_frozen_in_mid_press_is_never_trusted(road, noise: float, faults: 
 @pytest.mark.parametrize(
     ("part", "names"),
     [
-        (FaultyPart.LOWER, {"lower": "frozen_lower"}),
+        pytest.param(FaultyPart.LOWER, {"lower": "frozen_lower"}, marks=pytest.mark.long),
         (FaultyPart.UPPER, {"upper": "frozen_upper"}),
-        (FaultyPart.CROSSING, {"upper": "stuck_upper", "lower": "stuck_lower"}),
+        pytest.param(
+            FaultyPart.CROSSING, {"upper": "stuck_upper", "lower": "stuck_lower"}, marks=pytest.mark.long
+        ),
     ],
 )
-@pytest.mark.parametrize("noise", [3e-6, 1e-4])
+@pytest.mark.parametrize("noise", some_long([3e-6, 1e-4], 3e-6))
 def test_frozen_part_is_named_left_out_and_readmitted(
     road, part: FaultyPart, names: dict[str, str], noise: float
 ) -> None:
@@ -172,7 +178,9 @@ def test_frozen_part_is_named_left_out_and_readmitted(
     ("faults", "part", "kind", "wire"),
     [
         (Faults(open_lower=7), FaultyPart.LOWER, FaultKind.OPEN, {"lower": 7}),
-        (Faults(shorted_upper=1), FaultyPart.UPPER, FaultKind.SHORT, {"upper": 1}),
+        pytest.param(
+            Faults(shorted_upper=1), FaultyPart.UPPER, FaultKind.SHORT, {"upper": 1}, marks=pytest.mark.long
+        ),
     ],
 )
 def test_broken_wires_of_either_layer_are_in_the_field(

@@ -8,6 +8,7 @@ import pytest
 
 from skinnode.config import HandConfig
 from skinnode.host import Host
+from tests.lanes import some_long
 from vcan_sim.fleet import Fleet
 
 from .conftest import eventually
@@ -18,8 +19,8 @@ OF_THE_MACHINE = {"emergencies", "faulty", "stale", "operational"}
 """A simulator that is held up by other work is stale, and says that it skipped a scan (EMCY 0x8110)."""
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-4])
-@pytest.mark.parametrize("depth", [0.01, 0.5])
+@pytest.mark.parametrize("noise", some_long([0.0, 1e-6, 1e-4], 1e-6))
+@pytest.mark.parametrize("depth", some_long([0.01, 0.5], 0.5))
 def test_no_alarm_of_a_healthy_stream(
     make_hand: Callable[..., HandConfig], noise: float, depth: float
 ) -> None:

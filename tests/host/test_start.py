@@ -124,7 +124,7 @@ def test_solver_options_that_conflict_are_refused_before_the_nodes_are_asked(
 
 def test_nodes_start_although_their_heartbeats_are_rare(make_hand: Callable[..., HandConfig]) -> None:
     """With the longest heartbeat period that a hand file can set."""
-    hand = make_hand(bring_up={"heartbeat_ms": 10_000})
+    hand = make_hand(bring_up={"heartbeat_ms": 10_000}, sync={"period_ms": 400})
     with Fleet(hand), Host.from_config(hand) as host:
         host.reset_node("p0")
         assert eventually(lambda: host.health("p0").rejoins == 1, within_s=60.0)

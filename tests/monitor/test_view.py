@@ -27,6 +27,7 @@ from skinnode.monitor.session_faults import FaultBook, as_json
 from skinnode.monitor.theme import Paint, UiState, theme_for
 from skinnode.monitor.view_model import History, PatchView, View, judge_patch
 from skinnode.record import Recorder, replay
+from tests.lanes import some_long
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 
@@ -191,8 +192,8 @@ def test_the_posterior_tells_forces() -> None:
     assert patch.touches[0].force_n > 0.1
 
 
-@pytest.mark.parametrize("colours", ["rgb", "ansi", "none"])
-@pytest.mark.parametrize("patches", [1, 3, 16])
+@pytest.mark.parametrize("colours", some_long(["rgb", "ansi", "none"], "rgb"))
+@pytest.mark.parametrize("patches", some_long([1, 3, 16], 1, 3))
 def test_every_line_has_its_width_at_every_size(patches: int, colours: Colours) -> None:
     hand = a_hand(patches, sync={"period_ms": 200})
     with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from skinnode.canopen.nmt import NmtState
 from skinnode.protocol.profile import PatchProfile
+from tests.lanes import some_long
 from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS, Faults
 
 from ..c_kit import Kit, kits
@@ -107,7 +108,7 @@ COUNTED = {
 """Counters with other names than their fault."""
 
 
-@pytest.mark.parametrize("wire", WIRES, ids=WIRE_IDS)
+@pytest.mark.parametrize("wire", some_long(WIRES, WIRES[0]), ids=WIRE_IDS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_fault_of_the_simulator(kit_of: KitOf, fault: str, wire: dict[str, Any]) -> None:
     """With all chunks, then with only the changed ones."""
@@ -165,8 +166,10 @@ def random_frame(random: np.random.Generator, profile: PatchProfile, counter: in
     return is_summary, bytes(data)
 
 
-@pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: f"u{profile.code_bits}-{profile.bus}")
-@pytest.mark.parametrize("overflow", [0, 2, 240])
+@pytest.mark.parametrize(
+    "profile", some_long(PROFILES, PROFILES[0]), ids=lambda profile: f"u{profile.code_bits}-{profile.bus}"
+)
+@pytest.mark.parametrize("overflow", some_long([0, 2, 240], 240))
 def test_random_frames(kit_of: KitOf, fuzz_frames: int, profile: PatchProfile, overflow: int) -> None:
     random = np.random.default_rng([overflow, profile.n_chunks])
     left = max(1000, fuzz_frames // 9)

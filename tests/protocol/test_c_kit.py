@@ -17,6 +17,7 @@ from skinnode.protocol.c_kit import CONFIG_NAME, FIXED_NAMES, config_header, kit
 from skinnode.protocol.coordinates import pack_coordinates
 from skinnode.protocol.eds_files import REFERENCE_PROFILES, eds_name
 from skinnode.protocol.profile import PatchProfile
+from tests.lanes import some_long
 
 from ..c_kit import compile_c, require, write_kit
 
@@ -44,7 +45,7 @@ SIZES = [
 
 
 @pytest.mark.parametrize("compiler", ACCEPTED)
-@pytest.mark.parametrize("profile", SIZES, ids=eds_name)
+@pytest.mark.parametrize("profile", some_long(SIZES, SIZES[0]), ids=eds_name)
 def test_no_warning(profile: PatchProfile, compiler: str, tmp_path: Path) -> None:
     for level in ("-O2", "-Os"):
         output = ["-c", write_kit(profile, tmp_path), "-o", tmp_path / "kit.o"]

@@ -26,6 +26,7 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.eds_files import REFERENCE_PROFILES, dcf_text, eds_name, eds_text
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 from skinnode.protocol.summary import pack_checked_summary, pack_summary
+from tests.lanes import some_long
 
 EDS = Path(__file__).parents[2] / "eds"
 NODE_ID = 5
@@ -53,6 +54,12 @@ def profile(request: pytest.FixtureRequest) -> PatchProfile:
     return request.param
 
 
+by_few_profiles = pytest.mark.parametrize(
+    "profile", some_long(PROFILES, PROFILES[0], PROFILES[-1]), ids=eds_name
+)
+"""For tests that let another program read the file: a plain run has a classic profile and one of CAN FD."""
+
+
 # --- the files
 
 
@@ -67,6 +74,7 @@ def test_eds_holds_the_reference_files_and_nothing_else() -> None:
     assert {file.name for file in EDS.iterdir()} == {eds_name(reference) for reference in REFERENCE_PROFILES}
 
 
+@by_few_profiles
 def test_dcfchk_accepts_the_eds_without_a_word(profile: PatchProfile, tmp_path: Path) -> None:
     file = tmp_path / eds_name(profile)
     file.write_text(eds_text(profile))
@@ -99,6 +107,7 @@ def test_canopen_reads_every_entry_as_it_is_meant(profile: PatchProfile) -> None
             assert len(variable) in (entry.data_type.bits, 32), key  # the library keeps U24 in 32 bits
 
 
+@by_few_profiles
 def test_dcf_tools_read_every_default_as_it_is_meant(profile: PatchProfile, tmp_path: Path) -> None:
     file = tmp_path / "patch.eds"
     file.write_text(eds_text(profile))

@@ -112,6 +112,7 @@ def test_bursts_of_16_bits_are_found(data: bytes, last: int, burst: int) -> None
     assert scan_check(0xFFFF, wrong) != scan_check(0xFFFF, data)
 
 
+@pytest.mark.long
 def test_other_damage_escapes_once_in_65536() -> None:
     """Three codes of a chunk, each another than was packed: 48 wrong bits."""
     random = np.random.default_rng(3)

@@ -24,6 +24,7 @@ from skinnode.record.log_files import LogFiles
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import FrameLog
 from skinnode.transport.frame_log_reader import FrameLogReader
+from tests.lanes import some_long
 from vcan_sim.fleet import Fleet
 from vcan_sim.virtual_time import START_WALL_NS, VirtualClock
 
@@ -47,7 +48,7 @@ def bits(path: Path) -> list[tuple[object, ...]]:
     ]
 
 
-@pytest.mark.parametrize("through", [".mcap", ".blf", ".asc"])
+@pytest.mark.parametrize("through", some_long([".mcap", ".blf", ".asc"], ".mcap"))
 def test_a_recording_comes_back_byte_for_byte(recorded: Path, tmp_path: Path, through: str) -> None:
     middle, back = tmp_path / f"middle{through}", tmp_path / "back" / "run.log"
     back.parent.mkdir()
@@ -255,7 +256,7 @@ def test_a_damaged_source_is_converted_as_far_as_it_is_whole(recorded: Path, tmp
     assert told["frames"] == sum(1 for _ in FrameLogReader(source))
 
 
-@pytest.mark.parametrize("target", ["run.blf", "x.log", "x.asc", "x.mcap"])
+@pytest.mark.parametrize("target", some_long(["run.blf", "x.log", "x.asc", "x.mcap"], "x.mcap"))
 def test_the_copy_of_a_damaged_log_gives_the_fields_of_that_log(
     recorded: Path, tmp_path: Path, target: str
 ) -> None:

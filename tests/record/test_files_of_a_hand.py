@@ -23,6 +23,7 @@ from skinnode.record.replay import Replay
 from skinnode.remote.description import Description
 from skinnode.resolve.recording import recording_at
 from skinnode.resolve.settings import apply, variants
+from tests.lanes import some_long
 from vcan_sim.fleet import Fleet
 from vcan_sim.virtual_time import VirtualClock
 
@@ -68,7 +69,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return path, live
 
 
-@pytest.mark.parametrize("suffix", [".log", ".mcap"])
+@pytest.mark.parametrize("suffix", some_long([".log", ".mcap"], ".mcap"))
 def test_a_layout_file_is_in_the_recording(recorded: Recorded, tmp_path: Path, suffix: str) -> None:
     path, live = recorded
     if suffix == ".mcap":

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.lanes import some_long
 from vcan_sim.cli import main
 
 COMMAND = [sys.executable, "-c", "from vcan_sim.cli import main; main()"]
@@ -59,7 +60,7 @@ def test_runs_for_the_seconds_asked_with_a_line_each(hand: Path, capsys: pytest.
     assert last.startswith("sent 0 scans")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", some_long([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_ends_cleanly_when_told(hand: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(
         [*COMMAND, str(hand)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

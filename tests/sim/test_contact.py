@@ -167,6 +167,7 @@ def test_friction_points_against_the_slide_and_never_exceeds_its_limit() -> None
     np.testing.assert_allclose(force[:2], -friction * force[2] * slide / 5e-3, rtol=0.005)
 
 
+@pytest.mark.long
 def test_a_thin_bonded_film_presses_as_its_lubrication_equation() -> None:
     """An incompressible film much thinner than the contact: δ − r²/2R = −t³/(3G) ∇²p (Johnson, section 5.8).
 

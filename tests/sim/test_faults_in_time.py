@@ -21,6 +21,7 @@ from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.codes import Codes
 from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import AssemblerStats, Scan
+from tests.lanes import some_long
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.faulty_node import FaultyNode
 
@@ -157,7 +158,7 @@ def test_a_healthy_stream_is_whole() -> None:
     stream.assert_none_is_mixed()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", some_long(range(4), 0))
 def test_all_faults_at_once_are_counted_to_the_frame(seed: int) -> None:
     stream = Stream()
     stream.node._random = np.random.default_rng(seed)
@@ -199,7 +200,7 @@ def test_all_faults_at_once_are_counted_to_the_frame(seed: int) -> None:
     stream.assert_none_is_mixed()
 
 
-@pytest.mark.parametrize("place", [0, 1, 7, 15])
+@pytest.mark.parametrize("place", some_long([0, 1, 7, 15], 7))
 def test_one_wrong_counter_of_any_value(place: int) -> None:
     """One of a scan long past or of none costs its chunk. One of a scan to come ends the present one, and
     either spoils that scan too, or the stream begins anew after three periods."""
@@ -265,7 +266,7 @@ WIRES = [{}, {"code_bits": 24}, {"bus": "fd"}]
 IDS = ["u16", "u24", "fd"]
 
 
-@pytest.mark.parametrize("wire", WIRES, ids=IDS)
+@pytest.mark.parametrize("wire", some_long(WIRES, WIRES[0]), ids=IDS)
 @pytest.mark.parametrize("attack", ["displaced", "understated"])
 def test_a_scan_with_a_chunk_of_another_is_never_complete(attack: str, wire: dict[str, Any]) -> None:
     """A chunk with the counter of the next scan, whose own chunk is lost; a summary that says that only
@@ -315,8 +316,8 @@ def test_a_summary_without_its_check_makes_no_scan_complete() -> None:
     assert frames_counted(counted) == injected.pdos
 
 
-@pytest.mark.parametrize("wire", WIRES, ids=IDS)
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("wire", some_long(WIRES, WIRES[0]), ids=IDS)
+@pytest.mark.parametrize("seed", some_long(range(2), 0))
 def test_what_a_check_finds_among_all_other_faults(wire: dict[str, Any], seed: int) -> None:
     """Frames are lost, repeated, late and falsified, and only changed chunks are sent: nothing complete is
     mixed."""

@@ -13,6 +13,7 @@ from skinnode.canopen import indices as od
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.process import clock
+from tests.lanes import some_long
 from vcan_sim.bus_attacker import FLOOD_COB_ID, NO_BUS_FAULTS, BusFaults
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
@@ -91,7 +92,7 @@ def test_the_nodes_come_back_after_a_long_bus_off(running: Running) -> None:
     running.comes_back()
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("share", some_long([0.5, 1.0], 1.0))
 def test_a_starved_bus(running: Running, share: float) -> None:
     begin_ns, sent = clock.monotonic_ns(), running.fleet.injected_bus("can0").starved
     assert sent == 0
@@ -128,7 +129,7 @@ def test_a_rogue_master(running: Running) -> None:
     running.comes_back()
 
 
-@pytest.mark.parametrize("share", [0.02, 0.3])
+@pytest.mark.parametrize("share", some_long([0.02, 0.3], 0.02))
 def test_a_disturbed_bus(running: Running, share: float) -> None:
     running.suffer(3.0, disturbed=share)
     disturbed = running.fleet.injected_bus("can0").disturbed

@@ -13,6 +13,7 @@ from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
+from tests.lanes import some_long
 from vcan_sim.default_scene import Scene
 from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import parse_scene
@@ -115,7 +116,7 @@ def test_the_truth_of_a_scene_is_what_the_node_measures() -> None:
         np.testing.assert_allclose(patch.exact_ohm(t_ns), expected_ohm, rtol=1e-9)
 
 
-@pytest.mark.parametrize("period_ms", [100, 700])  # frames of 700 ms have little in common
+@pytest.mark.parametrize("period_ms", some_long([100, 700], 100))  # frames of 700 ms have little in common
 def test_the_host_is_right_about_an_ordinary_patch(period_ms: int) -> None:
     """With stated tolerances, fields are trusted, and 1 value in 1000 at most is beyond five deviations."""
     plan = hand(period_ms=period_ms, interface="timed", cycle_s=2.1)

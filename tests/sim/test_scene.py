@@ -10,6 +10,7 @@ import pytest
 
 from skinnode.config import SimulationConfig
 from skinnode.model.layout import PatchLayout
+from tests.lanes import some_long
 from vcan_sim.default_scene import LEAD_S, Scene
 
 LAYOUT = PatchLayout.preset("staggered", height_m=2e-3)
@@ -34,7 +35,7 @@ def test_a_depth_of_nothing_is_a_hand_at_rest() -> None:
         np.testing.assert_array_equal(play.upper_m(t), LAYOUT.upper_m)
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", some_long(range(4), 0))
 def test_a_stroke_presses_slides_and_lifts_as_configured(number: int) -> None:
     play = scene(number)
     times = play.lead_s + np.linspace(0, 3 * OPTIONS.cycle_s, 1500)
@@ -67,10 +68,11 @@ def test_the_sphere_stays_a_pitch_inside_the_patch() -> None:
         assert stroke.slide_m > 8e-3  # two pitches and more at this speed: far enough to see it slide
 
 
-def test_motion_is_smooth_enough_to_follow() -> None:
+@pytest.mark.parametrize("cycles", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_motion_is_smooth_enough_to_follow(cycles: int) -> None:
     """Between two instants a millisecond apart no electrode jumps: at most 2 mm/s at this depth and speed."""
     play = scene(2)
-    times = np.arange(0.0, 2 * OPTIONS.cycle_s, 1e-3) + play.lead_s
+    times = np.arange(0.0, cycles * OPTIONS.cycle_s, 1e-3) + play.lead_s
     path = np.array([play.upper_m(t) for t in times])
     assert np.abs(np.diff(path, axis=0)).max() < 2e-6
 

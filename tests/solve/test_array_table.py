@@ -179,6 +179,7 @@ def kernel_of(declaration: type[ArrayTable]) -> Callable[[NDArray[np.int64]], fl
     return kernel
 
 
+@pytest.mark.long
 def test_the_order_of_a_declaration_changes_no_result(staggered: sk.PatchLayout) -> None:
     """The stages of a frame by the declaration that stands, and by the same one in reverse order."""
     problem = sk.solve.wires.problem.PatchProblem.of(staggered)

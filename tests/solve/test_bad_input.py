@@ -75,7 +75,14 @@ def tracker_of(layout: str, method: str) -> sk.Tracker:
     )
 
 
-@pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
+PLAIN = [("staggered", "auto"), ("one electrode", "exact"), ("curved", "posterior")]
+"""Those of a plain run: each method, and layouts that a solver for flat or square patches does not expect."""
+
+
+@pytest.fixture(
+    params=[pytest.param(each, marks=[] if each in PLAIN else pytest.mark.long) for each in CASES],
+    ids=lambda case: f"{case[0]}-{case[1]}",
+)
 def case(request: pytest.FixtureRequest) -> tuple[str, sk.Tracker]:
     layout, method = request.param
     tracker = tracker_of(layout, method)
@@ -205,6 +212,7 @@ def test_noise_of_a_frame_that_is_none(case: tuple[str, sk.Tracker], noise: floa
     assert_truthful(field, np.zeros_like(field.displacement_m))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 def test_two_minutes_of_rest_leave_no_trace(method: str) -> None:
     """The field neither drifts nor leaves its deviations, and the noise stays as stated."""

@@ -9,6 +9,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.bench.truth import Press, Skin, random_press
+from tests.lanes import some_long
 
 from .loads import FAMILIES, Load, spheres
 
@@ -45,7 +46,7 @@ def deviations(field: sk.FieldFrame, load: Load, share: float) -> list[float]:
 
 
 @pytest.mark.parametrize("method", ["exact", "posterior"])
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", some_long(FAMILIES, "sphere", "two spheres"))
 def test_each_body_is_one_contact_in_every_frame(staggered, family, method):
     """Three presses each, going down and held; force and centre within five deviations."""
     tracker = tracker_of(staggered, method)
@@ -87,6 +88,7 @@ def test_two_hundred_presses_of_each_family(staggered, family, method):
     assert (np.array(z) > 5).sum() <= 1e-3 * len(z)
 
 
+@pytest.mark.long
 def test_exact_fields_have_hertzs_force_shear_and_centre(staggered):
     """40 spheres anywhere; RMS of (found − true)/deviation at most 1.2, none beyond 5."""
     rng = np.random.default_rng(4)

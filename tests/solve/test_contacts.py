@@ -7,6 +7,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.model.elastic import HertzContact, Rubber
+from tests.lanes import some_long
 
 from .press import frame_ohm
 
@@ -64,6 +65,7 @@ def test_a_sphere_is_one_contact_with_hertzs_numbers(staggered, depth, centre):
         assert found.area_m2 == pytest.approx(area, rel=0.5)
 
 
+@pytest.mark.long
 def test_forces_of_many_presses_spread_as_reported(staggered):
     """60 spheres anywhere: RMS of (found − true)/deviation about 1 for force, shear and centre."""
     rng = np.random.default_rng(4)
@@ -132,8 +134,8 @@ def test_two_spheres_are_two_contacts_the_stronger_first(staggered, apart):
         assert np.abs(found.centroid_m[:2] - truth.center_m).max() < 0.15 * staggered.pitch_m
 
 
-@pytest.mark.parametrize("name", ["staggered", "aligned"])
-@pytest.mark.parametrize("hold", [True, False])
+@pytest.mark.parametrize("name", some_long(["staggered", "aligned"], "staggered"))
+@pytest.mark.parametrize("hold", some_long([True, False], True))
 def test_nothing_touches_a_patch_at_rest(name, hold):
     """250 noisy frames: not one contact, and no sum of loads that a user would take for a touch."""
     layout = sk.PatchLayout.preset(name)

@@ -18,6 +18,7 @@ from skinnode.solve.checks import examination_time
 from skinnode.solve.checks.examination_time import PATIENCE
 from skinnode.solve.checks.fault_list import ADMIT, FRAMES
 from skinnode.solve.checks.field_trust import UNEXAMINED
+from tests.lanes import some_long
 from tests.solve.press import dent, noisy
 
 LAYOUT = sk.PatchLayout.preset("staggered")
@@ -54,7 +55,7 @@ PLACES = {"crossing": (4, 13), "lower wire open": (None, 13), "upper wire open":
 
 
 @pytest.mark.parametrize("method", ["exact", "posterior"])
-@pytest.mark.parametrize("kind", PLACES)
+@pytest.mark.parametrize("kind", some_long(PLACES, "crossing"))
 def test_wrong_readings_under_a_press_are_named_and_the_rest_goes_on(kind: str, method: str) -> None:
     rng = np.random.default_rng(3)
     tracker = sk.Tracker(LAYOUT, method=method, relative_noise=NOISE)
@@ -158,7 +159,7 @@ def test_half_of_the_readings_are_not_enough_and_the_reason_says_so() -> None:
     assert field.distrust == f"only {valid.mean():.0%} of the readings are usable"
 
 
-@pytest.mark.parametrize("method", ["exact", "posterior"])
+@pytest.mark.parametrize("method", some_long(["exact", "posterior"], "posterior"))
 def test_noise_larger_than_stated_is_not_taken_for_wrong_readings(method: str) -> None:
     """Until it has been estimated, no field is trusted; no reading is ever named."""
     rng = np.random.default_rng(7)
@@ -174,7 +175,7 @@ def test_noise_larger_than_stated_is_not_taken_for_wrong_readings(method: str) -
     assert field.noise_factor == pytest.approx(10.0, rel=0.2)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.15])
+@pytest.mark.parametrize("share", some_long([0.0, 0.15], 0.15))
 def test_a_grossly_wrong_reading_never_moves_a_trusted_wire(share: float) -> None:
     """It can move its whole wire so far that the readings, linearised at rest, seem to be caused by loads."""
     rng = np.random.default_rng(8)
@@ -190,6 +191,7 @@ def test_a_grossly_wrong_reading_never_moves_a_trusted_wire(share: float) -> Non
         tracker.update(readings(moved, rng))
 
 
+@pytest.mark.long
 def test_a_reading_that_jumps_during_a_press_is_left_out() -> None:
     """The error is small for a press, but no load changes so small a part of the patch in one frame."""
     rng = np.random.default_rng(9)

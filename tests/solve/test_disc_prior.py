@@ -14,6 +14,7 @@ from skinnode.bench.case import preset
 from skinnode.bench.truth import Converter, Skin
 from skinnode.solve.posterior.local import discs
 from skinnode.solve.posterior.local.discs import LOADS, Effects
+from tests.lanes import some_long
 
 PLACE = np.indices((3, 4)).reshape(2, -1).T.astype(np.float64)
 DISCS = np.array([[1.0, 1.5, np.log(2.0), -0.4, -0.5], [0.5, 3.0, np.log(2.5), 0.3, 0.2]])
@@ -126,6 +127,7 @@ def test_the_covariance_is_that_of_dense_algebra_with_the_prior_of_the_discs():
     np.testing.assert_allclose(found, expected, rtol=0.03, atol=0.03 * np.abs(expected).max())
 
 
+@pytest.mark.long
 def test_discs_reduce_the_error_of_small_bodies_and_its_claim(skin):
     """Hertz's sphere, punch and ridge at a noise of 1e-3, in closed form: no load of the prior's kind."""
     samples = {prior: [] for prior in ("discs", "cells")}
@@ -151,7 +153,7 @@ def test_discs_reduce_the_error_of_small_bodies_and_its_claim(skin):
     assert claims["discs"] < claims["cells"]
 
 
-@pytest.mark.parametrize("family", ["sphere", "punch", "ridge", "edge"])
+@pytest.mark.parametrize("family", some_long(["sphere", "punch", "ridge", "edge"], "sphere"))
 def test_errors_on_a_bonded_layer_are_within_the_claim(skin, family):
     """The simulator solves the contact; its skin moves sideways and much less far than a half-space."""
     for seed in range(4):
@@ -179,7 +181,10 @@ def test_a_small_body_on_a_thin_layer_is_found(family, number, name):
     assert (field.displacement_m[deep, 2] < 0.25 * truth[deep, 2]).all()
 
 
-@pytest.mark.parametrize(("name", "height"), [("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0)])
+@pytest.mark.parametrize(
+    ("name", "height"),
+    some_long([("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0)], ("staggered", 0.5)),
+)
 def test_a_single_electrode_that_the_readings_hardly_show_is_within_the_claim(name, height):
     """At a noise of 3e-3, a body that moves one electrode by a tenth of the clearance may go unnoticed."""
     skin = Skin(preset(name, height))
@@ -271,6 +276,7 @@ def test_discs_are_fitted_again_as_earlier_frames_reduce_the_noise_of_a_held_pre
     assert inside > 0.92 * count
 
 
+@pytest.mark.long
 def test_discs_are_found_while_a_press_grows_whose_first_frames_did_not_show_them(skin):
     """Flat punches in closed form, pressed slowly: from a quarter of the depth on, discs must pay."""
     sigma, frames = 1e-3, 15

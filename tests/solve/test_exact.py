@@ -13,6 +13,7 @@ import skinnode as sk
 from skinnode.solve.exact import stream
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.operators.codes import OPERATORS
+from tests.lanes import some_long
 
 from .press import HI, LO, STEPS, frame_ohm, hertz_press, noisy, quantised
 
@@ -311,7 +312,7 @@ def small() -> sk.PatchLayout:
     return sk.PatchLayout.preset("staggered", upper_wires=4, upper_electrodes=4, lower_electrodes=4)
 
 
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
+@pytest.mark.parametrize("options", some_long(OPTIONS, OPTIONS[0]), ids=str)
 @settings(deadline=None, max_examples=25)
 @given(st.dictionaries(st.integers(0, 9), CORRUPTIONS, max_size=6))
 def test_corrupt_frames_leave_no_trace(small, options, corruptions):

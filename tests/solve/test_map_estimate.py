@@ -21,6 +21,7 @@ from skinnode.solve.posterior.load_prior import PRIOR_DOUBT, SMOOTH_SHARE
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 from skinnode.solve.wires.problem import PatchProblem
+from tests.lanes import some_long
 
 from .press import frame_ohm, hertz_press
 
@@ -277,7 +278,10 @@ def test_directions_known_without_nuisances_are_mackays():
 
 @pytest.mark.parametrize(
     ("height", "depth", "noise", "frames"),
-    [(0.5, 0.5, 1e-5, 50), (0.5, 0.5, 1e-4, 50), (1.0, 0.7, 1e-5, 400), (1.0, 0.7, 1e-4, 50)],
+    some_long(
+        [(0.5, 0.5, 1e-5, 50), (0.5, 0.5, 1e-4, 50), (1.0, 0.7, 1e-5, 400), (1.0, 0.7, 1e-4, 50)],
+        (0.5, 0.5, 1e-5, 50),
+    ),
 )
 def test_annealing_a_jump_ends_where_small_steps_lead(height, depth, noise, frames):
     """A whole patch: annealed from rest, and followed through a press in steps small enough to track."""

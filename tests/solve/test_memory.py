@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from tests.lanes import some_long
 
 from .press import frame_ohm, hertz_press
 
@@ -32,7 +33,7 @@ def traced() -> Iterator[Callable[[], float]]:
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("method", ["exact", "posterior"])
+@pytest.mark.parametrize("method", some_long(["exact", "posterior"], "posterior"))
 def test_a_further_patch_of_a_layout_takes_little_memory(traced, method):
     layout = sk.PatchLayout.preset("staggered")
     first = sk.Tracker(layout, method=method, deadline_us=50_000.0)

@@ -20,6 +20,7 @@ import pytest
 import skinnode as sk
 from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.solve.posterior import load_prior, map_estimate, posterior
+from tests.lanes import some_long
 
 from .press import frame_ohm, hertz_press
 
@@ -98,8 +99,8 @@ SETTINGS = [  # layout, noise, least share in 95 % intervals; a ridge under much
 ]
 
 
-@pytest.mark.parametrize("kind", ["sphere", "gauss", "ridge", "plateau"])
-@pytest.mark.parametrize(("name", "sigma", "least"), SETTINGS)
+@pytest.mark.parametrize("kind", some_long(["sphere", "gauss", "ridge", "plateau"], "sphere", "plateau"))
+@pytest.mark.parametrize(("name", "sigma", "least"), some_long(SETTINGS, SETTINGS[1]))
 def test_reported_deviations_and_intervals_hold(name, sigma, least, kind):
     """A jump from rest to each of 10 scenes is solved: 95 % in the interval, no error beyond 5 deviations."""
     layout = sk.PatchLayout.preset(name)
@@ -201,7 +202,7 @@ def test_a_value_that_is_no_resistance_is_the_same_as_a_missing_one(staggered):
 BAD = ["nan", "inf", "negative", "zero", "huge", "tiny", "garbage", "not valid", "noise unknown", "shuffled"]
 
 
-@pytest.mark.parametrize("kind", BAD)
+@pytest.mark.parametrize("kind", some_long(BAD, "nan", "garbage"))
 def test_a_bad_frame_is_not_believed_and_the_next_is_solved(staggered, kind):
     rng = np.random.default_rng(6)
     tracker, other = sk.Posterior(staggered), sk.Posterior(staggered)
@@ -273,7 +274,9 @@ def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
         assert np.sqrt(np.mean(z**2)) < 1.15
 
 
-@pytest.mark.parametrize(("height", "sigma", "seed"), [(0.5, 1e-5, 48), (1.0, 1e-6, 40)])
+@pytest.mark.parametrize(
+    ("height", "sigma", "seed"), some_long([(0.5, 1e-5, 48), (1.0, 1e-6, 40)], (0.5, 1e-5, 48))
+)
 def test_a_prior_set_anew_that_leads_nowhere_costs_no_wire(height, sigma, seed):
     """Ridges whose solve fails once loads are expected along them: what was found before stays."""
     layout = sk.PatchLayout.preset("aligned", height_m=height * 4e-3)
@@ -492,6 +495,7 @@ def test_a_slow_drift_below_the_noise_is_not_held_forever(staggered):
         assert np.sqrt(np.mean(deviations(field, moved) ** 2)) < 1.3
 
 
+@pytest.mark.long
 def test_thirty_presses_leave_nothing_behind(staggered):
     rng = np.random.default_rng(14)
     tracker = sk.Posterior(staggered)

@@ -10,6 +10,7 @@ from skinnode.bench.trust_loads import draw
 from skinnode.bench.truth import Converter, Skin, stream
 from skinnode.protocol.codes import CodeScale, encode
 from skinnode.solve.inputs import CodeMap
+from tests.lanes import some_long
 
 LAYOUT = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
 SKIN = Skin(LAYOUT)
@@ -21,8 +22,13 @@ def tracker(noise: float, **options: object) -> sk.Tracker:
     return sk.Tracker(LAYOUT, relative_noise=noise, baseline_ohm=REST, **options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("noise", "method"), [(1e-5, "exact"), (1e-3, "posterior"), (1e-4, "posterior")])
-@pytest.mark.parametrize("kind", ["punch", "dent"])
+@pytest.mark.parametrize(
+    ("noise", "method"),
+    some_long(
+        [(1e-5, "exact"), (1e-3, "posterior"), (1e-4, "posterior")], (1e-5, "exact"), (1e-4, "posterior")
+    ),
+)
+@pytest.mark.parametrize("kind", some_long(["punch", "dent"], "punch"))
 def test_fields_with_and_without_the_detector_agree(noise: float, method: str, kind: str) -> None:
     """Within five standard deviations of their difference, and each with the truth."""
     rng = np.random.default_rng(4)
@@ -154,7 +160,7 @@ def test_codes_that_change_in_place_are_decoded_again() -> None:
         assert one.touch_odds == other.touch_odds
 
 
-@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("timed", some_long([True, False], True))
 def test_drift_during_a_gap_is_no_touch_if_the_times_are_known(timed: bool) -> None:
     """The scans pause for eight hours, in which the gain of each wire changes by 3 %, up or down."""
     rng = np.random.default_rng(11)
@@ -191,6 +197,7 @@ def test_options_of_the_detector_are_checked() -> None:
             tracker(1e-3, **{name: 0.0})
 
 
+@pytest.mark.long
 def test_more_false_alarms_find_slighter_touches() -> None:
     found = {}
     for rate in (0.01, 1000.0):

@@ -15,6 +15,7 @@ import skinnode as sk
 from skinnode.bench.trust_loads import Dent
 from skinnode.bench.truth import Press, Skin
 from skinnode.solve.detect.touch_detector import TouchDetector
+from tests.lanes import some_long
 
 NOISE, PERIOD_S = 1e-3, 0.08
 LAYOUT = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
@@ -89,8 +90,8 @@ def test_a_tap_of_one_scan_is_found() -> None:
         assert changes(touched) == [True, False]
 
 
-@pytest.mark.parametrize("drift", ["steady", "walk"])
-@pytest.mark.parametrize("noise", [1e-3, 1e-5])
+@pytest.mark.parametrize("drift", some_long(["steady", "walk"], "walk"))
+@pytest.mark.parametrize("noise", some_long([1e-3, 1e-5], 1e-5))
 def test_a_press_held_for_ten_minutes_stays_touched(noise: float, drift: str) -> None:
     """Although the gains then differ from those before by more than the press changes the readings."""
     stream = Stream(noise=noise, drift=drift)

@@ -17,6 +17,7 @@ from skinnode.protocol.codes import MISSING, CodeScale, as_baseline, decode, enc
 from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
+from tests.lanes import some_long
 
 from .press import frame_ohm, hertz_press
 
@@ -256,7 +257,10 @@ def test_a_wire_that_nobody_can_solve_is_not_trusted_alone(kind):
 
 
 @pytest.mark.parametrize(
-    ("name", "height", "depth"), [("staggered", 1.0, 0.5), ("staggered", 0.5, 0.4), ("staggered", 1.0, 0.3)]
+    ("name", "height", "depth"),
+    some_long(
+        [("staggered", 1.0, 0.5), ("staggered", 0.5, 0.4), ("staggered", 1.0, 0.3)], ("staggered", 1.0, 0.3)
+    ),
 )
 def test_a_jump_never_ends_converged_and_wrong(name, height, depth):
     """From rest to a deep press within one frame, each wire that claims to be CONVERGED lies within 6

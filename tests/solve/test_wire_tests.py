@@ -13,6 +13,7 @@ from skinnode.bench.truth import RUBBER
 from skinnode.model.elastic import HertzContact
 from skinnode.model.layout import Float
 from skinnode.solve.checks.wire_tests import GAIN_STD, WireTables, least_fitting
+from tests.lanes import some_long
 
 LAYOUT = sk.PatchLayout.preset("staggered")
 REST = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
@@ -56,7 +57,7 @@ def press(depth: float) -> Float:
 
 
 @pytest.mark.parametrize("method", ["exact", "posterior"])
-@pytest.mark.parametrize("layer", ["upper", "lower"])
+@pytest.mark.parametrize("layer", some_long(["upper", "lower"], "upper"))
 def test_a_wire_whose_gain_changes_by_one_percent_is_named_at_once(layer: str, method: str) -> None:
     rng, wire = np.random.default_rng(6), 4 if layer == "upper" else 14
     here = np.s_[wire] if layer == "upper" else np.s_[:, wire]

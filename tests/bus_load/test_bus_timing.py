@@ -173,9 +173,7 @@ def fd_bits_on_a_naive_bus(can_id: int, data: bytes) -> tuple[int, int]:
     return counts[0] + 1 + 1 + 7 + 3, counts[1] + len(checked) + fixed + 1
 
 
-@settings(deadline=None, max_examples=300)
-@given(frames=st.lists(st.tuples(STANDARD, FD_DATA), min_size=1, max_size=6))
-def test_fd_frames_as_on_the_naive_bus(frames: list[tuple[int, bytes]]) -> None:
+def fd_frames_as_on_the_naive_bus(frames: list[tuple[int, bytes]]) -> None:
     expected = [fd_bits_on_a_naive_bus(can_id, data) for can_id, data in frames]
     for (can_id, data), bits in zip(frames, expected, strict=True):
         payload = np.frombuffer(data, dtype=np.uint8).reshape(1, -1)
@@ -188,6 +186,14 @@ def test_fd_frames_as_on_the_naive_bus(frames: list[tuple[int, bytes]]) -> None:
     load.add(0, b"")  # a classic one among them: 53 bits
     assert load.frames == len(frames) + 1
     assert load.bits == round(53 + sum(nominal + fast / 5 for nominal, fast in expected))
+
+
+@pytest.mark.parametrize("examples", [50, pytest.param(300, marks=pytest.mark.long)])
+def test_fd_frames_as_on_the_naive_bus(examples: int) -> None:
+    check = given(frames=st.lists(st.tuples(STANDARD, FD_DATA), min_size=1, max_size=6))(
+        fd_frames_as_on_the_naive_bus
+    )
+    settings(deadline=None, max_examples=examples)(check)()
 
 
 def test_an_fd_frame_of_one_wire_takes_about_a_sixth_of_a_millisecond() -> None:

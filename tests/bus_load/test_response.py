@@ -124,9 +124,7 @@ def test_the_worst_case_happens(messages: list[Message], number: int) -> None:
     assert max(seen) == bound
 
 
-@settings(deadline=None, max_examples=200)
-@given(messages_on_a_bus(jitter=15), st.data())
-def test_nothing_is_worse(messages: list[Message], data: st.DataObject) -> None:
+def nothing_is_worse(messages: list[Message], data: st.DataObject) -> None:
     bounds = [response(messages, i) for i in range(len(messages))]
     queued = []
     for each in messages:
@@ -139,6 +137,12 @@ def test_nothing_is_worse(messages: list[Message], data: st.DataObject) -> None:
     for priority, time in play(queued):
         bound = bounds[priority]
         assert bound is None or time <= bound
+
+
+@pytest.mark.parametrize("examples", [40, pytest.param(200, marks=pytest.mark.long)])
+def test_nothing_is_worse(examples: int) -> None:
+    check = given(messages_on_a_bus(jitter=15), st.data())(nothing_is_worse)
+    settings(deadline=None, max_examples=examples)(check)()
 
 
 @settings(deadline=None)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODVariable, eds
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.model.layout import PatchLayout
@@ -233,11 +233,7 @@ writes = st.one_of(
 
 
 # ``make`` keeps nothing from one example to the next.
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(sequence=st.lists(writes, min_size=20, max_size=120))
-def test_no_sequence_of_writes_leaves_a_pdo_that_is_on_and_inconsistent(
-    make: Callable, sequence: list
-) -> None:
+def no_sequence_of_writes_leaves_a_pdo_that_is_on_and_inconsistent(make: Callable, sequence: list) -> None:
     desk = make()
     dictionary = parsed(eds_text(desk.node.profile))
     if sequence[0][2] % 2:
@@ -273,6 +269,16 @@ def test_no_sequence_of_writes_leaves_a_pdo_that_is_on_and_inconsistent(
         desk.node.on_frame(0x80, b"", desk.t_ns)
         desk.run(10)
     assert all(len(data) == lengths[can_id] for can_id, data, _ in desk.sent if can_id in lengths)
+
+
+@pytest.mark.parametrize("examples", [15, pytest.param(80, marks=pytest.mark.long)])
+def test_no_sequence_of_writes_leaves_a_pdo_that_is_on_and_inconsistent(
+    make: Callable, examples: int
+) -> None:
+    check = given(sequence=st.lists(writes, min_size=20, max_size=120))(
+        no_sequence_of_writes_leaves_a_pdo_that_is_on_and_inconsistent
+    )
+    settings(deadline=None, max_examples=examples)(check)(make=make)
 
 
 def test_identifiers_that_were_swapped_and_saved_are_those_after_a_reset(make: Callable) -> None:

@@ -220,9 +220,7 @@ def worlds(draw: st.DrawFn) -> tuple[ModelNode, list[Frame]]:
     return node, arrivals
 
 
-@settings(deadline=None, max_examples=250)
-@given(world=worlds(), polled=st.booleans())
-def test_no_scan_is_ever_mixed_from_two(world: tuple[ModelNode, list[Frame]], polled: bool) -> None:
+def no_scan_is_ever_mixed_from_two(world: tuple[ModelNode, list[Frame]], polled: bool) -> None:
     node, frames = world
     assembler = ScanAssembler(
         node.profile, counter_overflow=node.counter_overflow, period_ns=PERIOD, grace_ns=GRACE
@@ -253,6 +251,12 @@ def test_no_scan_is_ever_mixed_from_two(world: tuple[ModelNode, list[Frame]], po
     for frame in frames:
         came.setdefault(frame.sample, []).append(frame.t_ns)
     assert stats.scans_mixed <= sum(max(times) - min(times) > 2 * PERIOD for times in came.values())
+
+
+@pytest.mark.parametrize("examples", [50, pytest.param(250, marks=pytest.mark.long)])
+def test_no_scan_is_ever_mixed_from_two(examples: int) -> None:
+    check = given(world=worlds(), polled=st.booleans())(no_scan_is_ever_mixed_from_two)
+    settings(deadline=None, max_examples=examples)(check)()
 
 
 @st.composite
@@ -298,9 +302,7 @@ def changed(frame: Frame, at: int, by: int) -> Frame:
     return dataclasses.replace(frame, data=bytes(data))
 
 
-@settings(deadline=None, max_examples=250)
-@given(world=falsified())
-def test_nothing_false_is_ever_complete(world: tuple[ModelNode, list[Frame]]) -> None:
+def nothing_false_is_ever_complete(world: tuple[ModelNode, list[Frame]]) -> None:
     node, frames = world
     assembler = ScanAssembler(
         node.profile, counter_overflow=node.counter_overflow, period_ns=PERIOD, grace_ns=GRACE
@@ -320,6 +322,12 @@ def test_nothing_false_is_ever_complete(world: tuple[ModelNode, list[Frame]]) ->
     assert frames_counted(stats) == len(frames)
     assert stats.scans_complete == sum(scan.complete for scan in published)
     assert stats.scans_torn + stats.scans_unchecked == sum(not scan.complete for scan in published)
+
+
+@pytest.mark.parametrize("examples", [50, pytest.param(250, marks=pytest.mark.long)])
+def test_nothing_false_is_ever_complete(examples: int) -> None:
+    check = given(world=falsified())(nothing_false_is_ever_complete)
+    settings(deadline=None, max_examples=examples)(check)()
 
 
 # --- a channel in order: what must come out is known exactly

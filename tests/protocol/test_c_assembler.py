@@ -53,6 +53,7 @@ def test_any_channel(
     witness.confront(kit_of(node.profile))
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=80)
 @given(world=falsified())
 def test_falsified_frames(kit_of: KitOf, world: tuple[ModelNode, list[Frame]]) -> None:
@@ -123,7 +124,7 @@ def test_every_fault_of_the_simulator(kit_of: KitOf, fault: str, wire: dict[str,
     assert witness.confront(kit_of(stream.profile)) > 5
 
 
-@pytest.mark.parametrize("wire", WIRES, ids=WIRE_IDS)
+@pytest.mark.parametrize("wire", some_long(WIRES, WIRES[0]), ids=WIRE_IDS)
 def test_all_faults_at_once(kit_of: KitOf, wire: dict[str, Any]) -> None:
     stream, witness = stream_of(wire)
     shares = {**dict.fromkeys(OF_CHUNKS, 0.02), **dict.fromkeys(OF_SCANS, 0.04)}

@@ -55,17 +55,23 @@ def assert_codes(kit: Kit, resistances: list[int], fraction_bits: int, baselines
     np.testing.assert_array_equal(got, truth)
 
 
-@settings(deadline=None, max_examples=400)
-@given(
-    pairs=st.lists(
-        st.tuples(U32, st.one_of(st.floats(width=32), st.floats(0.5, 1e6, width=32))), min_size=1, max_size=20
-    ),
-    fraction_bits=st.integers(0, 31),
-)
-def test_any_resistance_and_any_real32_pattern(
+def any_resistance_and_any_real32_pattern(
     kit: Kit, pairs: list[tuple[int, float]], fraction_bits: int
 ) -> None:
     assert_codes(kit, [r for r, _ in pairs], fraction_bits, [b for _, b in pairs])
+
+
+@pytest.mark.parametrize("examples", [60, pytest.param(400, marks=pytest.mark.long)])
+def test_any_resistance_and_any_real32_pattern(kit: Kit, examples: int) -> None:
+    check = given(
+        pairs=st.lists(
+            st.tuples(U32, st.one_of(st.floats(width=32), st.floats(0.5, 1e6, width=32))),
+            min_size=1,
+            max_size=20,
+        ),
+        fraction_bits=st.integers(0, 31),
+    )(any_resistance_and_any_real32_pattern)
+    settings(deadline=None, max_examples=examples)(check)(kit=kit)
 
 
 def test_resistances_around_a_baseline(kit: Kit) -> None:

@@ -240,9 +240,7 @@ CHANGES = st.tuples(
 )
 
 
-@settings(deadline=None, max_examples=300)
-@given(traffic(), st.lists(CHANGES, max_size=8))
-def test_bursts_are_what_single_frames_are(
+def bursts_are_what_single_frames_are(
     sent: list[tuple[int, int, CanFrame]], changes: list[tuple[int, int, str]]
 ) -> None:
     """A rule, even one that hits no frame, makes the bus decide on each frame by itself."""
@@ -262,6 +260,12 @@ def test_bursts_are_what_single_frames_are(
     for station in range(3):
         assert in_bursts.counters(station) == one_by_one.counters(station)
         assert in_bursts.waiting(station) == one_by_one.waiting(station) == 0
+
+
+@pytest.mark.parametrize("examples", [50, pytest.param(300, marks=pytest.mark.long)])
+def test_bursts_are_what_single_frames_are(examples: int) -> None:
+    check = given(traffic(), st.lists(CHANGES, max_size=8))(bursts_are_what_single_frames_are)
+    settings(deadline=None, max_examples=examples)(check)()
 
 
 def test_a_frame_within_a_bit_of_the_start_interrupts_a_burst() -> None:

@@ -153,7 +153,9 @@ the skin crosses a fold, and a start from the smoothest displacement finds a smo
 the last, the posterior moves two wires away from the ends of their paths, and only one path is smooth."""
 
 
-@pytest.mark.parametrize("schedule", [sk.Uniform(), sk.Periodic(cycle=1), sk.Adaptive()])
+@pytest.mark.parametrize(
+    "schedule", some_long([sk.Uniform(), sk.Periodic(cycle=1), sk.Adaptive()], sk.Adaptive())
+)
 def test_a_smooth_root_to_which_the_samples_do_not_lead_is_not_converged(schedule):
     layout = sk.PatchLayout.preset("aligned", pitch_m=4e-3, height_m=2e-3)
     points = layout.upper_m[..., :2].reshape(-1, 2)

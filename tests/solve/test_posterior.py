@@ -156,7 +156,9 @@ def test_deviations_shrink_with_the_noise(staggered):
     assert reported[1] < reported[0] / 20
 
 
-@pytest.mark.parametrize("lost", ["a tenth", "half", "one wire", "three wires", "all but one wire"])
+@pytest.mark.parametrize(
+    "lost", some_long(["a tenth", "half", "one wire", "three wires", "all but one wire"], "half", "one wire")
+)
 def test_missing_resistances_cost_certainty_not_truth(staggered, lost):
     rng = np.random.default_rng(4)
     valid = np.ones(staggered.shape, bool)
@@ -249,7 +251,7 @@ SPOILT_WIRE = {
 }
 
 
-@pytest.mark.parametrize("kind", SPOILT_WIRE)
+@pytest.mark.parametrize("kind", some_long(SPOILT_WIRE, next(iter(SPOILT_WIRE))))
 def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
     """It alone is not CONVERGED, its deviation is its neighbours' knowledge of it, and the next good frame is
     solved as if nothing had happened."""
@@ -698,9 +700,9 @@ print(digest.hexdigest())
     "options",
     [
         {},
-        {"prior": "discs"},
-        {"drift": "patch", "estimate_noise": True, "model_error": 0.01},
-        {"normal_only": True, "hold": False, "scale_m": 1e-4},
+        pytest.param({"prior": "discs"}, marks=pytest.mark.long),
+        pytest.param({"drift": "patch", "estimate_noise": True, "model_error": 0.01}, marks=pytest.mark.long),
+        pytest.param({"normal_only": True, "hold": False, "scale_m": 1e-4}, marks=pytest.mark.long),
     ],
     ids=str,
 )

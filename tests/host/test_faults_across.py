@@ -90,6 +90,7 @@ def test_lost_chunks(running: Suffers) -> None:
     assert counted.duplicates == counted.late == counted.conflicts == 0
 
 
+@pytest.mark.long
 def test_duplicated_and_late_chunks(running: Suffers) -> None:
     running.until(
         Faults(duplicated=0.05, late=0.05),
@@ -103,18 +104,21 @@ def test_duplicated_and_late_chunks(running: Suffers) -> None:
     assert counted.scans_torn == injected.scans_spoilt
 
 
+@pytest.mark.long
 def test_lost_syncs(running: Suffers) -> None:
     running.until(Faults(sync_lost=0.2), lambda injected: injected.sync_lost > 3)
     assert running.counted().scans_missed == running.injected().sync_lost + running.overruns()
     assert running.counted().scans_torn == running.counted().chunks_lost == 0
 
 
+@pytest.mark.long
 def test_two_scans_under_one_counter(running: Suffers) -> None:
     running.until(Faults(torn=0.2), lambda injected: injected.torn > 3)
     assert running.counted().scans_mixed == running.injected().torn
     assert running.counted().conflicts == running.injected().torn_chunks
 
 
+@pytest.mark.long
 def test_reset_in_the_middle_of_a_scan(running: Suffers) -> None:
     boot_ups = running.host.health("p0").boot_ups
     running.until(Faults(reset=1.0), lambda injected: injected.reset > 0)
@@ -128,6 +132,7 @@ def test_unplugged_and_plugged_in_again(running: Suffers) -> None:
     assert eventually(lambda: running.host.health("p0").rejoins == 1)
 
 
+@pytest.mark.long
 def test_bus_off_and_recovery(running: Suffers) -> None:
     running.fleet.bus_off("can0", off=True)
     assert eventually(lambda: running.condition() is Condition.LOST)
@@ -137,6 +142,7 @@ def test_bus_off_and_recovery(running: Suffers) -> None:
     assert running.host.health("p0").last_emergency == 0x8140
 
 
+@pytest.mark.long
 def test_silent_and_deaf_node(running: Suffers) -> None:
     running.until(Faults(silent=True), lambda _: running.condition() is Condition.LOST)
     running.until(Faults(deaf=True), lambda _: running.condition() is Condition.STALE)

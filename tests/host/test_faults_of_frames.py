@@ -210,6 +210,7 @@ def test_lost_syncs(running: Hand) -> None:
     assert counted.scans_torn == counted.chunks_lost == 0
 
 
+@pytest.mark.long
 def test_everything_at_once(running: Hand) -> None:
     chunks = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted")
     faults = dict.fromkeys(chunks, 0.02) | dict.fromkeys(("torn", "summary_lost", "sync_lost"), 0.06)

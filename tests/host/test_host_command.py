@@ -158,6 +158,7 @@ def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig]) -> None:
         assert (status, errors) == (0, "")
 
 
+@pytest.mark.long
 def test_host_that_is_killed_is_followed_by_another(shared: tuple[Path, BusConfig]) -> None:
     """The nodes go on without it; the next one takes them up."""
     path, bus = shared

@@ -183,9 +183,7 @@ def test_late_frames_of_the_transfer_before_are_no_answers(transfer: Callable[[L
     transfer(line)
 
 
-@settings(deadline=None, max_examples=60)
-@given(st.sampled_from(TRANSFERS), st.sets(st.integers(0, 400), max_size=12), st.integers(1, 4))
-def test_whatever_is_lost_a_transfer_ends_and_the_next_is_whole(
+def whatever_is_lost_a_transfer_ends_and_the_next_is_whole(
     transfer: Callable[[Line], None], lost: set[int], density: int
 ) -> None:
     line = Line(lambda frame: len(line.seen) * density in lost or len(line.seen) in lost)
@@ -195,6 +193,14 @@ def test_whatever_is_lost_a_transfer_ends_and_the_next_is_whole(
     line.value = LONG
     block_read(line)
     block_write(line)
+
+
+@pytest.mark.parametrize("examples", [12, pytest.param(60, marks=pytest.mark.long)])
+def test_whatever_is_lost_a_transfer_ends_and_the_next_is_whole(examples: int) -> None:
+    check = given(st.sampled_from(TRANSFERS), st.sets(st.integers(0, 400), max_size=12), st.integers(1, 4))(
+        whatever_is_lost_a_transfer_ends_and_the_next_is_whole
+    )
+    settings(deadline=None, max_examples=examples)(check)()
 
 
 @settings(deadline=None, max_examples=30)

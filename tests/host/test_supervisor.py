@@ -17,6 +17,7 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
 from skinnode.process import clock
 from skinnode.transport import CanPort
+from tests.lanes import some_long
 
 from .conftest import SMALL, Rack, eventually, heard
 from .processor import ProcessorWait
@@ -88,7 +89,9 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         assert gaps(numbers) <= other.skipped + missed
 
 
-@pytest.mark.parametrize(("command", "booted"), [(0x81, 1), (0x82, 1), (0x80, 0), (0x02, 0)])
+@pytest.mark.parametrize(
+    ("command", "booted"), some_long([(0x81, 1), (0x82, 1), (0x80, 0), (0x02, 0)], (0x81, 1), (0x02, 0))
+)
 def test_a_node_that_somebody_resets_or_stops_runs_again(
     hand: HandConfig, rack: Rack, listener: CanPort, command: int, booted: int
 ) -> None:

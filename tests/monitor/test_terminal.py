@@ -170,6 +170,7 @@ def test_a_terminal_that_stalls_holds_up_neither_the_host_nor_the_end(
         assert states(fleet) == {NmtState.PRE_OPERATIONAL}
 
 
+@pytest.mark.long
 def test_a_terminal_that_stalled_gets_a_whole_picture(tmp_path: Path, crossing_hand: HandConfig) -> None:
     with Fleet(crossing_hand), terminal([*PROGRAM, str(write_hand(tmp_path, crossing_hand))]) as screen:
         assert screen.read_until("operational", "quit")

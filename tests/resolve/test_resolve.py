@@ -523,29 +523,53 @@ def test_a_damaged_recording_is_solved_and_named(recording: Path, tmp_path: Path
             "solver.metod: got an unknown key, allowed: a key of this table (did",
         ),
         (["--set", "solver.method=fast"], "solver.method: got 'fast', allowed: auto or exact or posterior"),
-        (["--set", "method=exact"], "--set: got 'method', allowed: solver.KEY, or patches.NAME.KEY"),
-        (["--set", "solver.method"], "--set: got 'solver.method', allowed: KEY=VALUE"),
-        (["--set", "solver.deadline_us=100"], "allowed: no time limit"),
+        pytest.param(
+            ["--set", "method=exact"],
+            "--set: got 'method', allowed: solver.KEY, or patches.NAME.KEY",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            ["--set", "solver.method"],
+            "--set: got 'solver.method', allowed: KEY=VALUE",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(["--set", "solver.deadline_us=100"], "allowed: no time limit", marks=pytest.mark.long),
         (["--set", "patches.p9.relative_noise=1e-5"], "allowed: a patch of the recording: p0, p1, p2; or *"),
-        (["--set", "patches.p0.node_id=9"], "--set: got 'patches.p0.node_id', allowed: solver.KEY"),
-        (["--set", "solver.drift=wire", "--set", "solver.drift=none"], "solver.drift only once"),
-        (
+        pytest.param(
+            ["--set", "patches.p0.node_id=9"],
+            "--set: got 'patches.p0.node_id', allowed: solver.KEY",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            ["--set", "solver.drift=wire", "--set", "solver.drift=none"],
+            "solver.drift only once",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
             ["--set", "solver.method=exact", "--set", "solver.drift=wire"],
             "cannot be solved with these settings",
+            marks=pytest.mark.long,
         ),
-        (
+        pytest.param(
             ["--set", "solver.max_std_m=1e-3,0.001"],
             "values that differ; these have the same effect as max_std_m=1e-3",
+            marks=pytest.mark.long,
         ),
-        (
+        pytest.param(
             ["--set", "solver.method=exact,exact"],
             "values that differ; these have the same effect as method=exact",
+            marks=pytest.mark.long,
         ),
-        (
+        pytest.param(
             ["--set", "patches.*.relative_noise=0"],
             "patches[0].relative_noise: got 0, allowed: a number of at least",
+            marks=pytest.mark.long,
         ),
-        (["--processes", "1", "--scheduler", "tcp://127.0.0.1:1"], "allowed: only without --scheduler"),
+        pytest.param(
+            ["--processes", "1", "--scheduler", "tcp://127.0.0.1:1"],
+            "allowed: only without --scheduler",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_an_option_that_cannot_be_used_is_one_line(

@@ -66,7 +66,7 @@ def changes(touched: list[bool | None]) -> list[bool | None]:
     return [now for now, before in zip(touched, [None, *touched[:-1]], strict=True) if now is not before]
 
 
-@pytest.mark.parametrize("drift", ["steady", "walk"])
+@pytest.mark.parametrize("drift", some_long(["steady", "walk"], "walk"))
 def test_presses_are_found_and_released_once(drift: str) -> None:
     """Spheres of 2 % and dents of 5 % of the layer height, within three frames; one onset, one release."""
     stream = Stream(drift=drift)
@@ -111,7 +111,7 @@ def test_a_press_that_deepens_in_ten_seconds_is_found() -> None:
     assert all(touched[100:])
 
 
-@pytest.mark.parametrize("noise", [1e-3, 1e-5])
+@pytest.mark.parametrize("noise", some_long([1e-3, 1e-5], 1e-5))
 def test_creep_after_a_release_ends(noise: float) -> None:
     """A tenth of a press of 30 % remains and decays in half a minute; a new press is found all the same."""
     stream = Stream(noise=noise)
@@ -150,7 +150,7 @@ def test_lost_readings_neither_alarm_nor_hide_a_press() -> None:
     assert all(stream.see(np.where(np.arange(30) == 4, np.nan, sphere(0.03)), 10)[3:])
 
 
-@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("lost", some_long([True, False], True))
 def test_drift_while_no_scan_is_usable_is_no_touch(lost: bool) -> None:
     """For five minutes, scans are lost or without readings; the gains drift as much as the prior expects."""
     stream = Stream(noise=1e-4, drift="walk")

@@ -131,21 +131,47 @@ FEW = {"upper_wires": 4, "upper_electrodes": 4, "lower_electrodes": 5}
             r"deviation of \d.* % .* the limit is 0\.25 %",
         ),
         ("aligned", {}, {}, "posterior", r"deviation of \d.* % .* the limit is 0\.25 %"),
-        ("aligned", {}, {"relative_noise": 1e-9}, "exact", r"deviation of 0\.0\d+ %"),
-        ("aligned", {}, {"normal_only": True}, "exact", r"deviation of 0\.\d+ %"),
+        pytest.param(
+            "aligned",
+            {},
+            {"relative_noise": 1e-9},
+            "exact",
+            r"deviation of 0\.0\d+ %",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            "aligned", {}, {"normal_only": True}, "exact", r"deviation of 0\.\d+ %", marks=pytest.mark.long
+        ),
         ("staggered", {"lower_wires": 29}, {}, "posterior", "29 lower wires for 30 unknowns"),
-        ("staggered", {"lower_wires": 29}, {"normal_only": True}, "exact", "deviation of"),
+        pytest.param(
+            "staggered",
+            {"lower_wires": 29},
+            {"normal_only": True},
+            "exact",
+            "deviation of",
+            marks=pytest.mark.long,
+        ),
         ("staggered", {}, {"drift": "wire"}, "posterior", "drift requested"),
-        ("staggered", {}, {"model_error": 0.01}, "posterior", "model_error requested"),
-        (
+        pytest.param(
+            "staggered",
+            {},
+            {"model_error": 0.01},
+            "posterior",
+            "model_error requested",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
             "staggered",
             {},
             {"estimate_noise": True, "drift": "patch"},
             "posterior",
             "drift and estimate_noise",
+            marks=pytest.mark.long,
         ),
-        ("staggered", {}, {"method": "posterior"}, "posterior", "requested"),
-        ("aligned", {}, {"method": "exact"}, "exact", "requested"),
+        pytest.param(
+            "staggered", {}, {"method": "posterior"}, "posterior", "requested", marks=pytest.mark.long
+        ),
+        pytest.param("aligned", {}, {"method": "exact"}, "exact", "requested", marks=pytest.mark.long),
     ],
 )
 def test_auto_takes_what_the_noise_allows_and_says_why(name, sizes, options, method, reason):

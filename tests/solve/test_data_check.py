@@ -12,6 +12,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.bench.truth import RUBBER
+from skinnode.config import parse_hand
 from skinnode.model.elastic import HertzContact
 from skinnode.model.layout import Float
 from skinnode.solve.checks import examination_time
@@ -20,6 +21,8 @@ from skinnode.solve.checks.fault_list import ADMIT, FRAMES
 from skinnode.solve.checks.field_trust import UNEXAMINED
 from tests.lanes import some_long
 from tests.solve.press import dent, noisy
+from vcan_sim.scenes import bind_scene, load_scene
+from vcan_sim.scenes.library import shipped_scenes
 
 LAYOUT = sk.PatchLayout.preset("staggered")
 NOISE = 1e-5
@@ -52,6 +55,28 @@ def spoil(kind: str, frame: Float, rest: Float) -> None:
 
 
 PLACES = {"crossing": (4, 13), "lower wire open": (None, 13), "upper wire open": (4, None)}
+
+
+@pytest.mark.parametrize("noise", some_long((3e-6, NOISE), NOISE))
+def test_a_ball_that_slides_with_friction_over_a_thin_layer_is_no_fault(noise: float) -> None:
+    """The prior expects such a narrow shear of one wire as little as wrong readings of that wire."""
+    hand = parse_hand(
+        {
+            "buses": [{"name": "can0", "interface": "virtual", "channel": "slide"}],
+            "patches": [{"name": "palm", "node_id": 1, "bus": "can0"}],
+        }
+    )
+    scene = bind_scene(load_scene(shipped_scenes()["press"], hand), hand)["palm"]
+    rest = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
+    tracker = sk.Tracker(LAYOUT, method="posterior", relative_noise=noise, baseline_ohm=rest)
+    rng = np.random.default_rng(0)
+    for t_s in np.arange(1.6, 3.6, 0.08):
+        moved = scene.truth(float(t_s)).displacement_m
+        here = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m + moved)
+        field = tracker.update(here * rng.normal(1.0, noise, LAYOUT.shape))
+        assert field.faults == ()
+        assert len(field.contacts) == 1
+        assert not field.trusted or off(field, moved) < 5.0
 
 
 @pytest.mark.parametrize("method", ["exact", "posterior"])

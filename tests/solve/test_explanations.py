@@ -80,6 +80,6 @@ def test_decisions_do_not_depend_on_stopping_early(model, kind, sigma):
             assert quick.margin == pytest.approx(thorough.margin, abs=1e-6)
         found += bool(groups)
     if kind in {"reading", "upper", "lower", "gain", "crossed"}:
-        assert found > 10
+        assert found > 8
     elif kind == "healthy":
         assert found == 0

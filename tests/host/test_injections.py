@@ -172,8 +172,8 @@ def four(make_hand: Callable[..., HandConfig]) -> HandConfig:
         {"name": f"p{i}", "node_id": 5 + i % 2, "bus": f"can{i // 2}", "layout": SMALL, "tolerances": "exact"}
         for i in range(4)
     ]
-    table["sync"]["period_ms"] = 50
-    table["bring_up"]["heartbeat_ms"] = 500  # nobody is lost because the machine is busy
+    table["sync"]["period_ms"] = 100
+    table["bring_up"]["heartbeat_ms"] = 1000  # nobody is lost because the machine is busy
     return parse_hand(table)
 
 

@@ -1,6 +1,6 @@
 """Count the calls of Python functions per patch and scan of a hand at rest, for docs/performance.md.
 
-Run with ``python docs/calls_at_rest.py``; it takes about a minute. Sixteen simulated patches send only
+Run with ``python docs/calls_at_rest.py``; it takes about two minutes. Sixteen simulated patches send only
 changed chunks to a host, in virtual time. Calls of functions written in C or compiled by Numba are not
 counted.
 """
@@ -34,7 +34,7 @@ def calls_of(scans: int) -> Counter[CodeType]:
         measure(FIXED, 0, scans, changed_only=True)
     finally:
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]  # typeshed requires a function
+        threading.setprofile(None)
     return found
 
 

@@ -1,6 +1,6 @@
 """Measure the fields of healthy skin on which a sphere slides with friction, for docs/limits.md.
 
-Run with ``python docs/friction.py [SCENES]``; 60 scenes take about five minutes.
+Run with ``python docs/friction.py [SCENES]``.
 
 In each scene, a rigid sphere presses on a bonded layer of 2 mm and slides 4 to 12 mm. Its radius (3 to 15
 mm), force (0.3 to 5 N), friction (0.2 to 1), place and direction are random. The displacements come from the

@@ -1,10 +1,12 @@
 """Measure the cost of `skinnode view` for 16 patches on four CAN FD buses at 40 SYNCs per second.
 
-    python docs/view_cost.py [SECONDS]
+    python docs/view_cost.py [SECONDS] [rest]
 
 The load is the same as in `skinnode bench pipeline`: a child process replays the frames of a touched hand
-over UDP. The script alternates between runs without a view and runs with a view that writes to the browser's
-data server. The host runs on one core; the generator, the drawing and the data server run on another.
+over UDP, or with `rest` those of an untouched hand. The script alternates between runs without a view and
+runs with a view that writes to the browser's data server. The host runs on one core; the generator, the
+drawing and the data server run on another. If permitted, the generator has real-time priority: frames that it
+sends late would look like a slow host.
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from skinnode.bench.load import LEAD_S, Generator
-from skinnode.bench.pipeline import _hand, _Reader, _settle
+from skinnode.bench.pipeline import FieldReader, full_hand, settle
 from skinnode.host import Host
 from skinnode.monitor.live_source import HostSource
 from skinnode.process.garbage_collection import responsive_threads, without_long_collections
@@ -32,7 +34,7 @@ from skinnode.view.drawing_thread import DrawingThread
 from skinnode.view.outputs import OutputOptions, open_output
 from skinnode.view.viewer_process import free_port
 
-ROUNDS: Final = 3
+ROUNDS: Final = 5
 
 
 def cpu_s(name: str) -> float:
@@ -42,7 +44,7 @@ def cpu_s(name: str) -> float:
     return sum(int(text.split()[0]) * 1e-9 for text in texts)
 
 
-def measure(hand: Any, generator: Generator, core: int, *, viewed: bool) -> dict[str, float]:
+def measure(hand: Any, generator: Generator, core: int, seconds: float, *, viewed: bool) -> dict[str, float]:
     generator.send_heartbeats([bus.name for bus in hand.buses])
     own = os.sched_getaffinity(0)
     with ExitStack() as stack:
@@ -55,7 +57,7 @@ def measure(hand: Any, generator: Generator, core: int, *, viewed: bool) -> dict
             os.sched_setaffinity(0, own)
         stack.enter_context(responsive_threads())
         host = stack.enter_context(Host.from_config(hand, open_port=DatagramPort))
-        reader = stack.enter_context(_Reader(host.fields()))
+        reader = stack.enter_context(FieldReader(host.fields()))
         source = stack.enter_context(HostSource(host))
         thread = None
         if viewed:
@@ -66,7 +68,7 @@ def measure(hand: Any, generator: Generator, core: int, *, viewed: bool) -> dict
         generator.wait()
         wall_s = time.monotonic() - begun_s
         process_s, drawing_s = time.process_time() - process_s, cpu_s("draw") - drawing_s
-        _settle(host)
+        settle(host)
         streams = list(host.stats().patches.values())
         published_ms, _ = reader.since(begin_ns)
         counts = None if thread is None else thread.counts
@@ -78,7 +80,7 @@ def measure(hand: Any, generator: Generator, core: int, *, viewed: bool) -> dict
         "p99": float(np.percentile(published_ms, 99)),
         "process": process_s / wall_s,
         "thread": drawing_s / wall_s,
-        "drawn_hz": 0.0 if counts is None else counts.drawn / wall_s / len(streams),
+        "drawn_hz": 0.0 if counts is None else counts.drawn / seconds / len(streams),
         "dropped": 0 if counts is None else counts.dropped,
     }
 
@@ -90,14 +92,17 @@ def main() -> None:
     rows: dict[bool, list[dict[str, float]]] = {False: [], True: []}
     print(f"load average {os.getloadavg()[0]:.1f}")
     with tempfile.TemporaryDirectory() as folder:
-        hand = _hand(4, True, 3.0, "udp", "", Path(folder), one_worker=True)
+        hand = full_hand(4, True, 3.0, "udp", "", Path(folder), one_worker=True)
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         with (
-            closing(Generator(hand, seconds, touched=True, core=cores[-1])) as generator,
+            closing(Generator(hand, seconds, touched="rest" not in sys.argv, core=cores[-1])) as generator,
             without_long_collections(),
         ):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
             for number in range(2 * ROUNDS):
                 viewed = bool(number % 2)
-                row = measure(hand, generator, cores[-1], viewed=viewed)
+                row = measure(hand, generator, cores[-1], seconds, viewed=viewed)
                 rows[viewed].append(row)
                 values = "  ".join(f"{name} {value:.4g}" for name, value in row.items())
                 print(f"{'with' if viewed else 'without'} view: {values}", flush=True)

@@ -181,13 +181,13 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
     names = [bus.name for bus in hand.buses]
     open_port = CanPort if hand.buses[0].interface == "socketcan" else DatagramPort
     generator.send_heartbeats(names)
-    with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
+    with Host.from_config(hand, open_port=open_port) as host, FieldReader(host.fields()) as reader:
         begin_ns = generator.begin()
         time.sleep(LEAD_S / 2)  # wait for the last heartbeats before the replay
         read_before = _read(host)
         before, begin_s = _cpu_s(), time.monotonic()
         sent = generator.wait()
-        _settle(host)
+        settle(host)
         wall_s = time.monotonic() - begin_s
         cpu_s = {group: used - before.get(group, 0.0) for group, used in _cpu_s().items()}
         stats, read = host.stats(), _read(host) - read_before
@@ -260,7 +260,7 @@ def _must(rows: list[Row]) -> list[Row]:
     return must
 
 
-class _Reader:
+class FieldReader:
     """Subscriber that records the arrival time of each field."""
 
     def __init__(self, fields: Subscription) -> None:
@@ -291,7 +291,7 @@ def _read(host: Host) -> int:
     return sum(bus.read for bus in host.stats().buses.values())
 
 
-def _settle(host: Host) -> None:
+def settle(host: Host) -> None:
     """Wait until the host's counters stop changing."""
     end_s, last = time.monotonic() + SETTLE_S, None
     while time.monotonic() < end_s:

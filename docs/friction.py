@@ -20,8 +20,15 @@ from skinnode.errors import ConfigError
 from skinnode.model.layout import Float
 from vcan_sim.scenes import bind_scene, parse_scene
 
-NOISES: Final = (3e-6, 1e-5, 1e-4, 1e-3)
-"""Relative noise of the readings."""
+ROWS: Final = (
+    (3e-6, "cells"),
+    (1e-5, "cells"),
+    (1e-4, "cells"),
+    (1e-4, "discs"),
+    (1e-3, "cells"),
+    (1e-3, "discs"),
+)
+"""Relative noise of the readings, and prior."""
 SCENES: Final = 60
 TIMES_S: Final = np.arange(0.6, 3.0, 0.12)
 LIMIT: Final = 5.0
@@ -63,13 +70,15 @@ def slide(rng: np.random.Generator) -> list[Float] | None:
     return [scene.truth(float(t_s)).displacement_m for t_s in TIMES_S]
 
 
-def measure(scenes: list[list[Float]], noise: float) -> dict[str, Any]:
+def measure(scenes: list[list[Float]], noise: float, prior: str) -> dict[str, Any]:
     """Solve all frames of the scenes, and count the fields that are wrong about healthy skin."""
     rest_ohm = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
     rng = np.random.default_rng(0)
     frames = untrusted = named = beyond = 0
     for moved in scenes:
-        tracker = sk.Tracker(LAYOUT, method="posterior", relative_noise=noise, baseline_ohm=rest_ohm)
+        tracker = sk.Tracker(
+            LAYOUT, method="posterior", relative_noise=noise, baseline_ohm=rest_ohm, prior=prior
+        )
         for truth in moved:
             noisy = rng.normal(1.0, noise, LAYOUT.shape)
             field = tracker.update(sk.resistance_ohm(LAYOUT, LAYOUT.upper_m + truth) * noisy)
@@ -85,12 +94,12 @@ def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else SCENES
     found = [slide(np.random.default_rng(seed)) for seed in range(count)]
     scenes = [moved for moved in found if moved is not None]
-    print("| noise | frames | not trusted | a fault reported | trusted, with a coordinate beyond 5 |")
-    print("|---|---|---|---|---|")
-    for noise in NOISES:
-        row = measure(scenes, noise)
+    print("| noise | prior | frames | not trusted | a fault reported | trusted, with a coordinate beyond 5 |")
+    print("|---|---|---|---|---|---|")
+    for noise, prior in ROWS:
+        row = measure(scenes, noise, prior)
         shares = " | ".join(f"{row[key] / row['frames']:.1%}" for key in ("untrusted", "named", "beyond"))
-        print(f"| {noise:.0e} | {row['frames']} | {shares} |", flush=True)
+        print(f"| {noise:.0e} | {prior} | {row['frames']} | {shares} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -121,6 +121,7 @@ def tracker_options(
         deadline_us=config.deadline_us,
         estimate_noise=config.estimate_noise,
         drift=config.drift,
+        prior=config.prior,
         past=config.past,
         normal_only=config.normal_only,
         max_std_m=config.max_std_m,

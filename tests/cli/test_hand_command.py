@@ -245,6 +245,12 @@ def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
     assert not said(notes(tmp_path, PALM), "solver.method")
 
 
+def test_discs_are_recommended_where_they_help(tmp_path: Path) -> None:
+    noisy = "relative_noise = 1e-3\n"
+    assert 'prior = "discs"' in said(notes(tmp_path, PALM + noisy + TIP), "solver.prior")["palm"]
+    assert not said(notes(tmp_path, '[solver]\nprior = "discs"\n' + PALM + noisy), "solver.prior")
+
+
 def test_forces_that_are_not_calibrated(tmp_path: Path) -> None:
     calibrated = "calibration = { young_pa = 0.8e6, force_calibrated = true }\n"
     listed = notes(tmp_path, PALM + calibrated + TIP)

@@ -100,6 +100,33 @@ def test_field_agrees_with_the_truth_within_what_it_claims(make_hand: Callable[.
     assert 0.7 < float(np.sqrt(np.mean(scores))) < 1.4
 
 
+def test_discs_reduce_the_error_of_a_noisy_patch() -> None:
+    """The key ``solver.prior`` of the hand file reaches the solver."""
+    error_m = {}
+    patch = {"name": "p0", "node_id": 5, "relative_noise": 1e-3, "tolerances": "exact"}
+    for prior in ("cells", "discs"):
+        hand = parse_hand(
+            {
+                "buses": [{"name": "can0", "interface": "timed", "channel": uuid.uuid4().hex[:8]}],
+                "patches": [patch],
+                "solver": {"prior": prior, "past": "off"},
+                "simulation": {"converter_noise": 1e-3, "depth": 0.3, "indenter_radius_m": 0.01},
+            }
+        )
+        errors = []
+        with Fleet(hand) as fleet, Host.from_config(hand) as host:
+            rest_m = hand.patches[0].layout.build().upper_m
+            for field in host.fields(timeout_s=10, capacity=1000):
+                if stamp(field).device_time_us:
+                    truth_m = fleet.truth_m("p0", stamp(field).device_time_us) - rest_m
+                    if np.abs(truth_m).max() > 200e-6:
+                        errors.append(float(np.sqrt(((field.displacement_m - truth_m) ** 2).mean())))
+                if len(errors) == 6:
+                    break
+        error_m[prior] = float(np.median(errors))
+    assert error_m["discs"] < 0.8 * error_m["cells"]
+
+
 def test_latest_is_there_for_a_control_loop(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         assert eventually(lambda: host.latest("p0") is not None and host.latest("p1") is not None)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from skinnode.bus_load.plan import BusPlan
     from skinnode.config import HandConfig
     from skinnode.host.limitations import Limitation
+    from skinnode.host.solve_rate import SolveRate
 
 app = App(
     help="Check or create a hand file, compute its bus load, print the JSON Schema, or write ROS 2 packages.",
@@ -35,15 +36,17 @@ def check(
 
     For each bus, the command prints two planned loads: the worst case, in which every frame has its maximum
     length, and the typical case, for random data. For each patch, it prints the worst-case time from SYNC to
-    the end of the summary. For each frame in `others`, it prints the longest wait for the bus. Notes list
-    results that the hand cannot provide, such as shear. No bus is opened. The exit status is 1 if the load of
-    a bus exceeds its max_load, 2 if the file cannot be used.
+    the end of the summary. For each frame in `others`, it prints the longest wait for the bus. The command
+    also measures how many scans per second this computer can solve at the hand's noise while all patches are
+    touched. Notes list results that the hand cannot provide, such as shear. No bus is opened. The exit status
+    is 1 if the load of a bus exceeds its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
     from skinnode.errors import BusLoadError, ConfigError
     from skinnode.host.hand_files import check_files
     from skinnode.host.limitations import limitations
+    from skinnode.host.solve_rate import solve_rate
     from skinnode.transport.port import allowed_interfaces, is_interface
 
     config = load_hand(hand)
@@ -58,17 +61,22 @@ def check(
             require_room(config, plan)
         except BusLoadError as error:
             refused.append(str(error))
-    limits = limitations(config)
+    rate = solve_rate(config)
+    limits = limitations(config, rate)
     if as_json:
         report = {
             "hand": config.name,
             "buses": [_facts(plan) for plan in plans],
             "refused": refused,
+            "solving": None
+            if rate is None
+            else {"threads": rate.threads, "scan_s": dict(rate.scan_s), "rate_hz": rate.rate_hz},
             "notes": [asdict(limit) for limit in limits],
         }
         typer.echo(json.dumps(report, indent=2))
     else:
         _print(config, plans)
+        typer.echo(f"\n{_solving(config, rate)}")
         _print_notes(config, limits)
     for line in refused:
         typer.echo(f"error: {line}", err=True)
@@ -127,6 +135,18 @@ def _print(config: HandConfig, plans: tuple[BusPlan, ...]) -> None:
             out.print(_other_table(plan))
         for line in _remarks(plan):
             out.print(line)
+
+
+def _solving(config: HandConfig, rate: SolveRate | None) -> str:
+    """Return a line about the scans that this computer can solve."""
+    if rate is None:
+        return "solving: not measured, because no kernels have been compiled yet; skinnode demo compiles them"
+    slowest = max(rate.scan_s, key=lambda name: rate.scan_s[name])
+    return (
+        f"solving: {1e3 * rate.scan_s[slowest]:.1f} ms of CPU time per scan of {slowest} as a touch moves; "
+        f"{rate.rate_hz:.3g} scans/s of each patch with {counted(rate.threads, 'thread')} if all patches are "
+        f"touched ({1e3 / config.sync.period_ms:.3g} planned)"
+    )
 
 
 def _print_notes(config: HandConfig, limits: Sequence[Limitation]) -> None:

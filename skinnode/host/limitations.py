@@ -14,6 +14,7 @@ from typing import Final
 from skinnode.compiled.jit import is_cold
 from skinnode.config import HandConfig, PatchConfig, SolverConfig
 from skinnode.host.scan_solver import tracker_options
+from skinnode.host.solve_rate import SolveRate
 from skinnode.model.layout import PatchLayout
 from skinnode.protocol.codes import CodeScale
 from skinnode.solve.cramer_rao import patch_std
@@ -48,13 +49,24 @@ class Limitation:
     """Missing result, and the reason why it is missing."""
 
 
-def limitations(hand: HandConfig) -> list[Limitation]:
+def limitations(hand: HandConfig, rate: SolveRate | None) -> list[Limitation]:
     """Return the limitations of a hand. Patches with the same limitation share an entry.
 
     The function compiles no kernels. It checks the solver's deadline only if the kernels are already
     compiled.
+
+    Args:
+        hand: The hand.
+        rate: Solve times measured on this computer; None if they are unknown.
     """
     patches: dict[tuple[str, str], list[str]] = {}
+    planned_hz = 1e3 / hand.sync.period_ms
+    if rate is not None and rate.rate_hz < planned_hz:
+        text = (
+            f"if all patches are touched, this computer solves {rate.rate_hz:.3g} scans per second of each "
+            f"patch, fewer than the planned {planned_hz:.3g}: it skips the other scans"
+        )
+        patches["sync.period_ms", text] = [patch.name for patch in hand.patches]
     for patch in hand.patches:
         for key, text in (*_of_results(patch, hand.solver), *_of_place(patch, hand)):
             patches.setdefault((key, text), []).append(patch.name)

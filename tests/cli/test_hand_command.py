@@ -11,11 +11,14 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import skinnode as sk
+import skinnode.host.solve_rate
 from skinnode.bus_load.plan import check_plan
 from skinnode.cli.main import app
 from skinnode.config import HandConfig, load_hand, parse_hand
 from skinnode.config.schema import SCHEMA_FILE, schema_text
 from skinnode.errors import ConfigError
+from skinnode.host.limitations import limitations
+from skinnode.host.solve_rate import SolveRate
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 
@@ -249,6 +252,33 @@ def test_discs_are_recommended_where_they_help(tmp_path: Path) -> None:
     noisy = "relative_noise = 1e-3\n"
     assert 'prior = "discs"' in said(notes(tmp_path, PALM + noisy + TIP), "solver.prior")["palm"]
     assert not said(notes(tmp_path, '[solver]\nprior = "discs"\n' + PALM + noisy), "solver.prior")
+
+
+def test_how_many_scans_can_be_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text('[[buses]]\nname = "can0"\n[sync]\nperiod_ms = 400\n[solver]\nworkers = 2\n' + PALM + TIP)
+    solving = json.loads(command("check", str(path), "--json").stdout)["solving"]
+    assert set(solving["scan_s"]) == {"palm", "tip"}
+    assert 1e-5 < solving["scan_s"]["palm"] < 10
+    assert solving["rate_hz"] == pytest.approx(2 / sum(solving["scan_s"].values()))
+    line = next(line for line in command("check", str(path)).stdout.splitlines() if "solving: " in line)
+    assert re.search(
+        r"scans/s of each patch with 2 threads if all patches are touched \(2\.5 planned\)", line
+    )
+    monkeypatch.setattr(skinnode.host.solve_rate, "is_cold", lambda _: True)
+    assert json.loads(command("check", str(path), "--json").stdout)["solving"] is None
+    assert "solving: not measured" in command("check", str(path)).stdout
+
+
+def test_a_computer_that_is_too_slow_for_the_planned_rate(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text('[[buses]]\nname = "can0"\n[sync]\nperiod_ms = 400\n' + PALM + TIP)
+    hand = load_hand(path)
+    slow, fast = (SolveRate(1, {"palm": 3 * share, "tip": share}) for share in (0.11, 0.09))
+    (note,) = [limit for limit in limitations(hand, slow) if limit.key == "sync.period_ms"]
+    assert "solves 2.27 scans per second of each patch, fewer than the planned 2.5" in note.text
+    assert not [limit for limit in limitations(hand, fast) if limit.key == "sync.period_ms"]
+    assert SolveRate(4, {"palm": 0.5, "tip": 0.1}).rate_hz == 2.0  # a patch has at most one thread
 
 
 def test_forces_that_are_not_calibrated(tmp_path: Path) -> None:

@@ -34,8 +34,8 @@ layer, it reached 95 nats (scene ``press`` with eight seeds for noises of 3e-6 a
 larger margins: see docs/limits.md."""
 MARGIN_OF_EXCHANGE: Final = 40.0
 """Minimum margin for reporting two exchanged wires, in nats. With a margin of 80, wires that had been
-exchanged before the tare were reported too late: 0.2 % of the trusted coordinates had errors beyond 5 standard
-deviations (``bench trust --seed 1 --only "upper wires crossed, tared"``)."""
+exchanged before the tare were reported too late: 0.2 % of the trusted coordinates had errors beyond 5
+standard deviations (``bench trust --seed 1 --only "upper wires crossed, tared"``)."""
 MARGIN_OF_WIRE: Final = 20.0
 """Minimum margin for reporting a wire that contradicts the others, in nats. At this value, no faults were
 reported in 6,800 healthy frames of deep slides (noise 3e-6), or in 270 frames with six kinds of press (noise

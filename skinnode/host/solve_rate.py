@@ -20,6 +20,7 @@ import numpy as np
 
 from skinnode.compiled.jit import is_cold
 from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
 from skinnode.host.scan_solver import tracker_options
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
@@ -66,7 +67,11 @@ class _Settings:
 
 
 def solve_rate(hand: HandConfig) -> SolveRate | None:
-    """Measure the solve times of a hand's patches; return None if the kernels have not been compiled yet."""
+    """Measure the solve times of a hand's patches; return None if the kernels have not been compiled yet.
+
+    Raises:
+        ConfigError: if the solver cannot compute displacements for a patch's layout.
+    """
     if any(is_cold(kernel) for kernel in KERNELS[hand.solver.prior]):
         return None
     times: dict[str, float] = {}
@@ -76,7 +81,10 @@ def solve_rate(hand: HandConfig) -> SolveRate | None:
         options = tracker_options(
             patch, hand.solver, relative_noise=noise, period_s=1e-3 * hand.sync.period_ms
         )
-        times[patch.name] = _scan_s(layout, _Settings(options, repr(options), noise))
+        try:
+            times[patch.name] = _scan_s(layout, _Settings(options, repr(options), noise))
+        except ValueError as error:  # the host would refuse the patch, too
+            raise ConfigError(f"patch {patch.name!r}", layout.name, str(error)) from None
     threads = hand.solver.workers or len(os.sched_getaffinity(0))
     return SolveRate(min(threads, len(times)), times)
 

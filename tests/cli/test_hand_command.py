@@ -248,6 +248,18 @@ def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
     assert not said(notes(tmp_path, PALM), "solver.method")
 
 
+def test_a_layout_that_the_host_would_refuse(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    few = "layout = { lower_wires = 20 }\n"
+    path.write_text(
+        '[[buses]]\nname = "can0"\n[sync]\nperiod_ms = 400\n[solver]\nmethod = "exact"\n' + PALM + few
+    )
+    refused = command("check", str(path)).exception
+    assert isinstance(refused, ConfigError)
+    assert str(refused).startswith("patch 'palm'")
+    assert "20 lower wires for 30 unknowns" in str(refused)
+
+
 def test_discs_are_recommended_where_they_help(tmp_path: Path) -> None:
     noisy = "relative_noise = 1e-3\n"
     assert 'prior = "discs"' in said(notes(tmp_path, PALM + noisy + TIP), "solver.prior")["palm"]

@@ -18,7 +18,8 @@ import skinnode as sk
 from skinnode.config import parse_hand
 from skinnode.errors import ConfigError
 from skinnode.model.layout import Float
-from vcan_sim.scenes import bind_scene, parse_scene
+from vcan_sim.scenes import bind_scene, load_scene, parse_scene
+from vcan_sim.scenes.library import shipped_scenes
 
 ROWS: Final = (
     (3e-6, "cells"),
@@ -90,6 +91,21 @@ def measure(scenes: list[list[Float]], noise: float, prior: str) -> dict[str, An
     return {"frames": frames, "untrusted": untrusted, "named": named, "beyond": beyond}
 
 
+def shipped(noise: float, seeds: int = 8) -> tuple[int, int]:
+    """Return the number of frames of the shipped scene ``press``, and of those with a reported fault."""
+    scene = bind_scene(load_scene(shipped_scenes()["press"], HAND), HAND)["palm"]
+    moved = [scene.truth(float(t_s)).displacement_m for t_s in np.arange(1.6, 3.6, 0.08)]
+    rest_ohm = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
+    named = 0
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        tracker = sk.Tracker(LAYOUT, method="posterior", relative_noise=noise, baseline_ohm=rest_ohm)
+        for truth in moved:
+            noisy = rng.normal(1.0, noise, LAYOUT.shape)
+            named += bool(tracker.update(sk.resistance_ohm(LAYOUT, LAYOUT.upper_m + truth) * noisy).faults)
+    return seeds * len(moved), named
+
+
 def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else SCENES
     found = [slide(np.random.default_rng(seed)) for seed in range(count)]
@@ -100,6 +116,9 @@ def main() -> None:
         row = measure(scenes, noise, prior)
         shares = " | ".join(f"{row[key] / row['frames']:.1%}" for key in ("untrusted", "named", "beyond"))
         print(f"| {noise:.0e} | {prior} | {row['frames']} | {shares} |", flush=True)
+    for noise in (3e-6, 1e-5):
+        frames, named = shipped(noise)
+        print(f"scene press, noise {noise:.0e}: a fault reported in {named} of {frames} frames", flush=True)
 
 
 if __name__ == "__main__":

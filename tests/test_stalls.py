@@ -60,6 +60,7 @@ def run(folder: Path, *options: str, fails_in_setup: bool = False, third: bool =
     return done.returncode, done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("workers", "fails_in_setup"),
     some_long([(0, True), (2, False)], (2, False)),

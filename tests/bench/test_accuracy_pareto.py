@@ -75,6 +75,7 @@ def test_the_table_has_a_line_for_each_method_and_motion(folder, figures):
         assert f"{row['error']:.1%}" in line
 
 
+@pytest.mark.long
 def test_the_plot_has_a_mark_for_each_method(folder, figures):
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread

@@ -72,6 +72,7 @@ def test_node_tells_how_late_it_was_and_what_a_frame_costs(tmp_path):
     assert "chunk pacing, exact" in result.output
 
 
+@pytest.mark.long
 def test_a_solver_that_misses_the_accuracy_is_drawn_without_a_time(tmp_path):
     file = tmp_path / "solve.svg"
     rows = [

@@ -323,6 +323,7 @@ def test_bad_options_are_refused_before_the_work(monkeypatch, options: tuple[str
     assert not isinstance(result.exception, AssertionError)
 
 
+@pytest.mark.long
 def test_a_press_after_two_electrodes_seemed_to_swap_is_not_expected_elsewhere() -> None:
     """A load of many expected deviations makes the prior anew, though little else has changed: 7.1 deviations
     before."""

@@ -60,6 +60,7 @@ def test_frames_stuffed_by_hand() -> None:
     assert exact_bits(1, b"") == 50
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=300)
 @given(can_id=STANDARD, data=DATA)
 def test_data_frames_as_on_the_naive_bus(can_id: int, data: bytes) -> None:

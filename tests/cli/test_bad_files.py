@@ -255,6 +255,7 @@ BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", some_long(BOMBS, "size.npz", "ints.toml"))
 def test_a_small_file_that_needs_much_memory_is_refused_before(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

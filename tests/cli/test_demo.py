@@ -88,6 +88,7 @@ def test_a_lost_frame_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any("torn" in fault for fault in report.faults)
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_an_error_above_its_uncertainty_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """A gain error that appears after the baseline was taken: the solver cannot know it."""

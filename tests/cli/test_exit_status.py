@@ -177,6 +177,7 @@ def is_stall(err: str) -> bool:
     return re.fullmatch(r"((fault: thumb: |node 5 \().*\n)+", err) is not None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("command", "number"), list(marked(IN_PROCESSES, IN_PROCESSES[0])))
 def test_what_runs_until_it_is_told_has_done_its_work(
     folder: Path, multicast_group: str, command: str, number: int
@@ -293,6 +294,7 @@ main()
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("turn", "number"),
     some_long(list(zip([1, 2, 3], SIGNALS, strict=True)), (2, SIGNALS[1])),

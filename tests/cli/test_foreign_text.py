@@ -52,6 +52,7 @@ class TestPrintable:
         assert printable("x" * 201) == "x" * 200 + "…"
         assert printable("\x1b" * 1_000_000) == (r"\x1b" * 50) + "…"
 
+    @pytest.mark.long
     def test_is_fit_for_a_terminal_whatever_it_is_given(self) -> None:
         everything = "".join(map(chr, range(0x11_0000)))
         assert printable(everything, 1 << 24).isprintable()

@@ -124,6 +124,7 @@ def master(multicast_group: str) -> Iterator[Master]:
         yield Master(port)
 
 
+@pytest.mark.long
 def test_a_node_of_the_users_own_source(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--layout", "aligned", "--serial", "77", "--json"]
     with running(multicast_group, *options, cwd=sources) as process:
@@ -231,6 +232,7 @@ def test_a_memory_that_is_of_no_use_is_a_fault(
     assert run().returncode == 0  # put aside, and a new one begun
 
 
+@pytest.mark.long
 def test_two_processes_do_not_share_a_memory(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--store", "patch.json"]
     with running(multicast_group, *options, cwd=sources) as owner:
@@ -302,6 +304,7 @@ def test_another_node_with_the_same_node_id_is_a_fault(
     assert "fault: 1 boot-up or heartbeat from another node with this node-ID" in done.stdout
 
 
+@pytest.mark.long
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:
     """Switch state global, configure node-ID 9, store, waiting state (CiA 305); then as after a power cut."""
     options = ["--source", "my_sources:Board", "--store", "patch.json", "--serial", "5"]

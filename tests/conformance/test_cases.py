@@ -69,6 +69,7 @@ def test_at_least_105_apply_to_a_patch() -> None:
     assert len(CASES) - len(NOT_APPLICABLE) >= 105
 
 
+@pytest.mark.long
 def test_a_patch_without_memory_fails_nothing() -> None:
     """What asks it to store does not apply; that its sheet says that it stores is a warning."""
     channel = f"no-memory-{uuid.uuid4().hex[:8]}"

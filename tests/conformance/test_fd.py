@@ -11,6 +11,7 @@ from skinnode.conformance import Verdict, run_cases, select
 from .conftest import bench_on, patch_on
 
 
+@pytest.mark.long
 def test_its_pdos_states_and_dictionary_pass() -> None:
     channel = f"conformance-{uuid.uuid4().hex[:8]}"
     with patch_on(channel, fd=True), bench_on(channel, fd=True) as dut:

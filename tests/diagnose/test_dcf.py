@@ -101,6 +101,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("dcf")
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data_type=st.sampled_from(sorted(STRINGS)), data=st.binary(max_size=40) | st.text().map(str.encode))
 @example(data_type=0x09, data=b"caf\xc3\xa9\t")

@@ -135,6 +135,7 @@ THUMB_AND_INDEX = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("faults", THUMB_AND_INDEX)
 def test_faults_of_the_skin(hand_file: HandFile, on: On, faults: tuple[Any, ...]) -> None:
     fault, what, sure, other_fault, other_what, other_sure = faults
@@ -150,6 +151,7 @@ def test_faults_of_the_skin(hand_file: HandFile, on: On, faults: tuple[Any, ...]
         assert [value[0] for value in told.values()] == [how_sure]
 
 
+@pytest.mark.long
 def test_a_second_master(hand_file: HandFile, on: On) -> None:
     file = hand_file()
     hand = load_hand(file)
@@ -271,6 +273,7 @@ class _Page(html.parser.HTMLParser):
         self.outside += [value for name, value in attrs if name in ("src", "href") and value]
 
 
+@pytest.mark.long
 def test_the_report_needs_nothing_else(
     hand_file: HandFile, on: On, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from skinnode.canopen import indices as od
 from skinnode.config import PatchConfig, load_hand
@@ -107,6 +108,7 @@ def test_an_emergency_that_names_something_else_stands_alone() -> None:
     assert "emergency messages received during the check" in causes
 
 
+@pytest.mark.long
 def test_the_command_prints_causes_first(hand_file: Callable[..., Path], on: Callable[[Any], Any]) -> None:
     file = hand_file()
     hand = load_hand(file)
@@ -123,6 +125,7 @@ def test_the_command_prints_causes_first(hand_file: Callable[..., Path], on: Cal
     assert text.index("probable consequences:") < text.index("thumb: the node reports an error")
 
 
+@pytest.mark.long
 def test_a_host_of_the_hand_is_neither_somebody_nor_unknown(
     hand_file: Callable[..., Path], on: Callable[[Any], Any]
 ) -> None:

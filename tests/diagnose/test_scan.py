@@ -155,6 +155,7 @@ def test_hand_says_who_is_missing_or_another(bus: BusConfig, powered: Powered, t
     ]
 
 
+@pytest.mark.long
 def test_an_empty_bus_is_a_fault(bus: BusConfig) -> None:
     done = run(["scan"], bus)
     assert done.status == 1

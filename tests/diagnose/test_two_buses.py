@@ -33,6 +33,7 @@ def two_buses(tmp_path: Path, on: Callable[[Any], Any]) -> Path:
     return file
 
 
+@pytest.mark.long
 def test_a_patch_is_found_on_its_bus(two_buses: Path) -> None:
     for patch, serial in (("palm", 54), ("thumb", 55), ("index", 65)):
         done = run(["info", patch, "--hand", two_buses, "--json"])
@@ -59,6 +60,7 @@ def test_a_node_id_of_both_buses_is_asked_about(two_buses: Path, command: list[s
     )
 
 
+@pytest.mark.long
 def test_a_patch_named_like_a_number_is_not_mistaken_for_a_node(two_buses: Path) -> None:
     """The index, node 6, is renamed to 5, the node-ID of both other patches."""
     two_buses.write_text(two_buses.read_text().replace('"index"', '"5"'))
@@ -80,6 +82,7 @@ def test_a_node_id_of_no_patch_needs_a_bus(two_buses: Path) -> None:
     assert "got 'up', allowed: one of left, right" in run(["scan", "--hand", two_buses, "--bus", "up"]).stderr
 
 
+@pytest.mark.long
 def test_scan_and_nmt_all_take_every_bus(two_buses: Path) -> None:
     done = run(["scan", "--hand", two_buses, "--json"])
     assert done.status == 0

@@ -273,6 +273,7 @@ def test_a_stranger_stops_or_resets_a_node(running: Running, command: int) -> No
         running.assert_back()
 
 
+@pytest.mark.long
 def test_a_second_node_with_the_same_id_comes_and_goes(running: Running) -> None:
     table = running.host.hand.model_dump(mode="json")
     twin = parse_hand({**table, "patches": table["patches"][:1], "buses": table["buses"][:1]})
@@ -306,6 +307,7 @@ def test_a_host_that_is_restarted_finds_its_nodes_running(make_hand: Callable[..
             Running(fleet, host).assert_back()
 
 
+@pytest.mark.long
 def test_a_node_that_lost_its_configuration_is_configured_again(make_hand: Callable[..., HandConfig]) -> None:
     """Operational by its heartbeats, it rejects every SYNC: its counter overflow is 0 again, as after a reset
     in the middle of a bring-up whose boot-up message was lost."""

@@ -270,6 +270,7 @@ def test_a_touch_is_neither_noise_nor_drift() -> None:
         assert patch.watch.wires == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("radius_m", some_long([None, 0.005, 0.04, 0.3], 0.005))
 def test_nothing_is_wrong_with_a_patch_that_is_pressed_or_left_alone(
     radius_m: float | None, monkeypatch: pytest.MonkeyPatch

@@ -147,6 +147,7 @@ OF_PATCH: list[tuple[type, str, Callable[[Any], bool], str]] = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("owner", "name", "concerns", "doing"),
     some_long(OF_PATCH, OF_PATCH[0], OF_PATCH[-1]),
@@ -212,6 +213,7 @@ def test_what_only_a_bring_up_mends_is_mended(
         assert streams(host, "p0")
 
 
+@pytest.mark.long
 def test_a_patch_that_cannot_be_solved_is_brought_up_anew_ever_more_seldom(
     hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -160,6 +160,7 @@ def test_counters_of_scans_long_past_or_impossible(running: Hand) -> None:
     assert counted.scans_torn == injected.scans_spoilt
 
 
+@pytest.mark.long
 def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Hand) -> None:
     """One of a scan to come stops the stream for three periods: nobody can know which counter is right. What
     becomes of each of them is counted in tests/sim/test_faults_in_time.py, where time stands still."""
@@ -262,6 +263,7 @@ def test_summaries_that_claim_that_the_rest_is_unchanged(running: Hand) -> None:
     assert counted.scans_torn == counted.chunks_lost == 0
 
 
+@pytest.mark.long
 def test_summaries_without_the_check_that_the_node_sends(running: Hand) -> None:
     injected = running.suffer(Faults(unchecked=0.4))
     counted, bus = running.stream().assembler, running.host.stats().buses["can0"]

@@ -194,6 +194,7 @@ def test_bus_off_and_recovery(make_hand: Callable[..., HandConfig]) -> None:
     assert discrepancies(host.stats()) == []
 
 
+@pytest.mark.long
 def test_fleet_that_is_started_anew_below_a_host(make_hand: Callable[..., HandConfig]) -> None:
     """Its nodes hear SYNC with a counter before they are told that there is one."""
     hand = make_hand(patches=1)
@@ -223,6 +224,7 @@ def test_end_of_an_error_that_is_lost(make_hand: Callable[..., HandConfig]) -> N
         assert eventually(lambda: host.health("p0").error_register == 0)
 
 
+@pytest.mark.long
 def test_second_node_with_the_same_id(
     make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -405,6 +405,7 @@ def test_a_hand_of_two_masters_has_none(
                 host.hands()
 
 
+@pytest.mark.long
 def test_the_frames_end_with_the_host_and_a_silence_is_a_timeout(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         frames = host.hands(timeout_s=0.3)

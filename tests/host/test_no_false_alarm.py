@@ -19,6 +19,7 @@ OF_THE_MACHINE = {"emergencies", "faulty", "stale", "operational"}
 """A simulator that is held up by other work is stale, and says that it skipped a scan (EMCY 0x8110)."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", some_long([0.0, 1e-6, 1e-4], 1e-6))
 @pytest.mark.parametrize("depth", some_long([0.01, 0.5], 0.5))
 def test_no_alarm_of_a_healthy_stream(

@@ -120,6 +120,7 @@ def test_dcfgen_reads_it_and_keys_are_those_of_the_documentation(name: str, tmp_
         assert received == {0x280 + patch.node_id for patch in patches.values()}
 
 
+@pytest.mark.long
 def test_a_patch_booted_with_it_is_as_one_that_the_host_configured(
     hand: HandConfig,
     rack_of: Callable[[HandConfig], Rack],
@@ -156,6 +157,7 @@ def test_a_patch_booted_with_it_is_as_one_that_the_host_configured(
         assert writes == []  # the guest finds nothing to correct
 
 
+@pytest.mark.long
 def test_patches_of_different_sizes_have_their_own_eds(tmp_path: Path) -> None:
     sizes = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
     bus = {"name": "can0", "interface": "socketcan", "channel": 'can"0'}

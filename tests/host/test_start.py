@@ -122,6 +122,7 @@ def test_solver_options_that_conflict_are_refused_before_the_nodes_are_asked(
     )
 
 
+@pytest.mark.long
 def test_nodes_start_although_their_heartbeats_are_rare(make_hand: Callable[..., HandConfig]) -> None:
     """With the longest heartbeat period that a hand file can set."""
     hand = make_hand(bring_up={"heartbeat_ms": 10_000}, sync={"period_ms": 400})

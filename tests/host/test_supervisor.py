@@ -146,6 +146,7 @@ def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, 
         assert host.health("p1").boot_ups == boot_ups
 
 
+@pytest.mark.long
 def test_searches_for_absent_nodes_do_not_delay_a_node_that_is_back(
     make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
 ) -> None:

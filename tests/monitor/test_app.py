@@ -247,6 +247,7 @@ def test_pause_holds_the_picture_while_the_host_goes_on() -> None:
         in_app(source, play)
 
 
+@pytest.mark.long
 def test_help_keys_and_sizes() -> None:
     hand = a_hand(2)
     with closing(Pressed(hand)), Host.from_config(hand) as host, HostSource(host) as source:

@@ -23,6 +23,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return run_here("monitor", *arguments)
 
 
+@pytest.mark.long
 def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
     """Of a process of its own, on a bus between processes."""
     command = [*PROGRAM, str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "3"]
@@ -118,6 +119,7 @@ def test_without_textual_one_line_says_what_to_install(monkeypatch: pytest.Monke
     assert "sh install.sh tui" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_simulated_patches_are_a_hand_to_begin_with() -> None:
     done = run("--simulate", "--json", "--seconds", "2")
@@ -126,6 +128,7 @@ def test_simulated_patches_are_a_hand_to_begin_with() -> None:
     assert all(patch["rate_hz"] > 0 for patch in newest["patches"].values()), done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_the_simulated_patches_play_a_scene(tmp_path: Path) -> None:
     """Without a scene, a sphere presses on each patch."""

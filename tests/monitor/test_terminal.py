@@ -95,6 +95,7 @@ def states(fleet: Fleet) -> set[NmtState]:
     return {report.nmt_state for report in fleet.report()}
 
 
+@pytest.mark.long
 def test_keys_without_colours_and_a_clean_end(tmp_path: Path, crossing_hand: HandConfig) -> None:
     command = [*PROGRAM, str(write_hand(tmp_path, crossing_hand))]
     with Fleet(crossing_hand) as fleet, terminal(command, NO_COLOR="1") as screen:
@@ -121,6 +122,7 @@ def parameters(said: bytes) -> set[bytes]:
     }
 
 
+@pytest.mark.long
 def test_a_fault_of_the_session_is_its_exit_status(tmp_path: Path, crossing_hand: HandConfig) -> None:
     with (
         Fleet(crossing_hand) as fleet,
@@ -135,6 +137,7 @@ def test_a_fault_of_the_session_is_its_exit_status(tmp_path: Path, crossing_hand
         assert b"fault: p1: lost" in screen.said.rpartition(b"\x1b[?1049l")[2]
 
 
+@pytest.mark.long
 def test_a_terminal_that_vanishes_leaves_the_nodes_pre_operational(
     tmp_path: Path, crossing_hand: HandConfig
 ) -> None:

@@ -249,6 +249,7 @@ class TestOneOwner:
         FileMemory(path).save(KEPT)
         assert os.listdir(path.parent) == [path.name]
 
+    @pytest.mark.long
     def test_many_at_once(self, path: Path) -> None:
         """Processes that claim and release as fast as they can: never two owners."""
         script = (
@@ -292,6 +293,7 @@ for line in sys.stdin:
 """
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_killed_at_any_moment(path: Path) -> None:
     """Processes that do nothing but save are killed. What is left is one of their configurations."""

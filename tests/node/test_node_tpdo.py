@@ -310,6 +310,7 @@ class TestMany:
         # EMCY 0x8210 names RPDO 512 = 0x200, the length and the one wanted
         assert desk.frame(0x3F1) == [(0x084, "10 82 11 00 00 01 02 00")]
 
+    @pytest.mark.long
     def test_idle_ones_cost_nothing(self, make: Callable) -> None:
         """Calls made for a foreign frame, a remote one, a SYNC and a turn of the timer with one TPDO due: the
         same among 2 enabled ones as among 300."""

@@ -338,6 +338,7 @@ def arrivals_in_order(frames: Sequence[Frame], copies: Sequence[int]) -> Iterato
         yield from [frame] * count
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=150)
 @given(
     profile=st.sampled_from(PROFILES),
@@ -402,6 +403,7 @@ def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
     )
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=100)
 @given(
     profile=st.sampled_from(PROFILES),

@@ -61,6 +61,7 @@ def test_the_code_is_the_one_of_the_formula(scale: CodeScale, baseline: float, d
     assert encode(resistance, baseline, scale) == code
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=300)
 @given(
     scale=st.just(CodeScale(16)) | st.just(CodeScale(24)) | scales(),

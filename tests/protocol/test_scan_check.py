@@ -98,6 +98,7 @@ def test_every_wrong_bit_and_every_two_wrong_bits_are_found() -> None:
     assert len(set(turned)) == largest
 
 
+@pytest.mark.long
 def test_every_other_value_of_one_code_is_found() -> None:
     """A burst of 16 bits at most, wherever it is."""
     for place in range(3):

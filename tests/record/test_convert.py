@@ -48,6 +48,7 @@ def bits(path: Path) -> list[tuple[object, ...]]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("through", some_long([".mcap", ".blf", ".asc"], ".mcap"))
 def test_a_recording_comes_back_byte_for_byte(recorded: Path, tmp_path: Path, through: str) -> None:
     middle, back = tmp_path / f"middle{through}", tmp_path / "back" / "run.log"
@@ -256,6 +257,7 @@ def test_a_damaged_source_is_converted_as_far_as_it_is_whole(recorded: Path, tmp
     assert told["frames"] == sum(1 for _ in FrameLogReader(source))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("target", some_long(["run.blf", "x.log", "x.asc", "x.mcap"], "x.mcap"))
 def test_the_copy_of_a_damaged_log_gives_the_fields_of_that_log(
     recorded: Path, tmp_path: Path, target: str

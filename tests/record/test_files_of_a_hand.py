@@ -69,6 +69,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return path, live
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", some_long([".log", ".mcap"], ".mcap"))
 def test_a_layout_file_is_in_the_recording(recorded: Recorded, tmp_path: Path, suffix: str) -> None:
     path, live = recorded
@@ -123,6 +124,7 @@ def test_the_layout_file_can_be_given_later(recorded: Recorded, tmp_path: Path) 
     assert {which: found.get(which) for which in live} == live
 
 
+@pytest.mark.long
 def test_a_file_that_changes_during_a_run_does_not_change_the_recording(tmp_path: Path) -> None:
     hand, path = with_layout_file(tmp_path), tmp_path / "run.log"
     with VirtualClock(), Fleet(hand), Recorder(hand, path) as recorder:

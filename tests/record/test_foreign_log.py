@@ -92,6 +92,7 @@ def by_time(fields: list[FieldFrame], offset_ns: int) -> dict[tuple[str, int], F
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "channel", some_long(["can3", "left", "vcan7"], "can3"), ids=["its channel", "its name", "the only bus"]
 )
@@ -140,6 +141,7 @@ def test_a_hand_file_never_replaces_a_journal(recorded: Path, tmp_path: Path, su
         replay(path, hand=hand_file(tmp_path))
 
 
+@pytest.mark.long
 def test_frames_of_another_bus_are_left_out(recorded: Path, tmp_path: Path) -> None:
     """The only bus is that of the first frame; another channel has other content."""
     hand = hand_file(tmp_path, recorded)

@@ -114,6 +114,7 @@ def bits(run: Replay) -> list[tuple[str, int, bytes]]:
     return [(*key(field), field.displacement_m.tobytes()) for field in run]
 
 
+@pytest.mark.long
 def test_rosbags_reads_the_fields_that_the_host_gave(run: Any) -> None:
     path, hand, live = run
     rest_m = {patch.name: patch.layout.build().upper_m for patch in hand.patches}
@@ -327,6 +328,7 @@ def test_a_file_cut_anywhere_gives_every_whole_chunk(tmp_path: Path) -> None:
     assert before == 500
 
 
+@pytest.mark.long
 def test_garbage_costs_the_chunks_that_it_covers(tmp_path: Path) -> None:
     """Even if it claims a length, or that the data end here."""
     whole, path = written(tmp_path / "x.mcap", 500), tmp_path / "bad.mcap"

@@ -120,6 +120,7 @@ assert stats.failure is not None and "writing to the disk failed" in stats.failu
 """
 
 
+@pytest.mark.long
 def test_a_disk_that_is_full_at_the_end_of_a_recording_is_reported(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", RECORD, str(tmp_path)],

@@ -110,6 +110,7 @@ def assert_same(path: Path, live: dict[tuple[str, int], FieldFrame]) -> None:
         assert other.status == field.status
 
 
+@pytest.mark.long
 def test_a_run_with_faults_is_the_same_again_on_every_interface(
     recorded_bus: BusConfig, tmp_path: Path
 ) -> None:

@@ -110,6 +110,7 @@ def test_a_replay_gives_the_bits_of_the_live_run(
         Recorder(hand, path)
 
 
+@pytest.mark.long
 def test_health_follows_the_heartbeat_period_of_the_nodes(tmp_path: Path) -> None:
     """A guest keeps the period that the bus's master has set, whatever its hand file says."""
     hand, path = a_hand(), tmp_path / "run.log"
@@ -271,6 +272,7 @@ for path in sys.argv[1:]:
 """
 
 
+@pytest.mark.long
 def test_a_full_disk_is_one_line_and_nobody_is_held_up(tmp_path: Path) -> None:
     paths = [tmp_path / f"{kind}.{kind}" for kind in ("log", "blf", "mcap")]
     done = subprocess.run(
@@ -289,6 +291,7 @@ def test_a_full_disk_is_one_line_and_nobody_is_held_up(tmp_path: Path) -> None:
         assert list(replay(path)) == []
 
 
+@pytest.mark.long
 def test_contacts_and_forces_are_in_the_json_of_host_and_replay(tmp_path: Path) -> None:
     file, path = tmp_path / "hand.toml", tmp_path / "run.log"
     sizes = ", ".join(f"{name} = {value}" for name, value in SMALL.items())

@@ -48,6 +48,7 @@ def said(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int,
     return int(str(ended.value.code or 0)), capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_program_uses_the_hand_of_the_command(
     hand_file: Path, port: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -148,6 +148,7 @@ def solved_live(recording: Path, **solver: object) -> dict[tuple[str, int], byte
     return fields
 
 
+@pytest.mark.long
 def test_a_sweep_has_a_file_and_a_line_for_each_value(recording: Path, tmp_path: Path, in_turn: None) -> None:
     results = resolve(recording, "-o", tmp_path, "--set", "solver.method=exact,posterior", "--processes", 1)
     assert [each["settings"] for each in results] == [{"solver.method": m} for m in ("exact", "posterior")]
@@ -341,6 +342,7 @@ def test_a_layout_file_is_found_from_any_folder(
     assert job.captures[0].finished(PartFiles(tmp_path))
 
 
+@pytest.mark.long
 def test_the_layout_that_a_node_has_supplied_can_be_replaced(tmp_path: Path, in_turn: None) -> None:
     def a_hand(**layout: object) -> HandConfig:
         bus = {"name": "can0", "interface": "timed", "channel": "supplied"}
@@ -403,6 +405,7 @@ class Killed(BaseException):
     """Stands in for SIGKILL."""
 
 
+@pytest.mark.long
 def test_a_command_killed_at_any_rename_of_its_result_continues(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -479,6 +482,7 @@ def test_a_killed_command_continues_where_it_was(recording: Path, tmp_path: Path
     assert result["fields"] == len(list(replay(recording)))
 
 
+@pytest.mark.long
 def test_unknown_deviations_do_not_lower_the_mean(recording: Path, tmp_path: Path, in_turn: None) -> None:
     """In the second half of the recording, all chunks are missing."""
     lossy = tmp_path / "lossy.log"
@@ -607,6 +611,7 @@ def test_a_recording_that_changes_meanwhile_is_refused(recording: Path, tmp_path
         known.opened(hand)
 
 
+@pytest.mark.long
 def test_a_log_of_another_master_is_solved_with_the_hand_file(
     recording: Path, tmp_path: Path, in_turn: None
 ) -> None:

@@ -60,6 +60,7 @@ def test_runs_for_the_seconds_asked_with_a_line_each(hand: Path, capsys: pytest.
     assert last.startswith("sent 0 scans")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", some_long([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_ends_cleanly_when_told(hand: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(

@@ -181,6 +181,7 @@ def test_a_bad_text_is_one_line_and_status_2(
         assert "none now" in vcan_sim("inject")[1].splitlines()[1]
 
 
+@pytest.mark.long
 def test_several_simulators_are_told_apart(
     hand: Path,
     environment: dict[str, str],

@@ -165,6 +165,7 @@ def test_a_schedule_repeats() -> None:
 # --- scenes
 
 
+@pytest.mark.long
 def test_faults_start_and_end_at_their_times(virtual: VirtualClock) -> None:
     plan = scene(
         {"where": "palm", "fault": "lost=1.0", "from_s": 0.5, "to_s": 1.0},
@@ -261,6 +262,7 @@ def test_a_fault_that_goes_on_in_another_table_does_not_pause(virtual: VirtualCl
         assert events(fleet) == [(0.2, "palm:frozen on"), (0.6, "palm:frozen off")]
 
 
+@pytest.mark.long
 def test_a_patch_drifts_and_warms(virtual: VirtualClock) -> None:
     """The node sends R / R0: 1 + 0.1 t while it drifts, and 1.02 at ten kelvin."""
     plan = scene(
@@ -310,6 +312,7 @@ def test_without_power_nothing_becomes_due(virtual: VirtualClock) -> None:
         assert before + 2 <= fleet.injected("palm").babbled <= before + 5
 
 
+@pytest.mark.long
 def test_a_second_node_with_the_node_id(virtual: VirtualClock) -> None:
     plan = scene({"where": "palm", "fault": "duplicate_node_id", "from_s": 0.5, "to_s": 2.0})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
@@ -328,6 +331,7 @@ def test_a_second_node_with_the_node_id(virtual: VirtualClock) -> None:
     assert fleet.tally("palm").discrepancies() == []
 
 
+@pytest.mark.long
 def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> None:
     with Fleet(HAND, scene=scene({"where": "palm", "fault": "silent"})) as fleet:
         clock.sleep(1.0)
@@ -341,6 +345,7 @@ def test_a_fleet_of_real_time_plays_its_faults_in_virtual_time() -> None:
         assert events(fleet) == [(0.2, "palm:frozen on"), (0.4, "palm:frozen off")]
 
 
+@pytest.mark.long
 def test_the_schedule_of_a_fleet_that_is_started_again_goes_on(virtual: VirtualClock) -> None:
     plan = scene(
         {"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 1.0},

@@ -200,6 +200,7 @@ def test_all_faults_at_once_are_counted_to_the_frame(seed: int) -> None:
     stream.assert_none_is_mixed()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", some_long([0, 1, 7, 15], 7))
 def test_one_wrong_counter_of_any_value(place: int) -> None:
     """One of a scan long past or of none costs its chunk. One of a scan to come ends the present one, and

@@ -85,6 +85,7 @@ def test_bus_off(running: Running) -> None:
     running.comes_back()
 
 
+@pytest.mark.long
 def test_the_nodes_come_back_after_a_long_bus_off(running: Running) -> None:
     running.fleet.inject_bus("can0", BusFaults(bus_off=True))
     clock.sleep(1.2 * MOST_STATIONS)  # the nodes reopen their port about once a second
@@ -92,6 +93,7 @@ def test_the_nodes_come_back_after_a_long_bus_off(running: Running) -> None:
     running.comes_back()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", some_long([0.5, 1.0], 1.0))
 def test_a_starved_bus(running: Running, share: float) -> None:
     begin_ns, sent = clock.monotonic_ns(), running.fleet.injected_bus("can0").starved
@@ -117,6 +119,7 @@ def test_a_starved_bus(running: Running, share: float) -> None:
     assert running.fleet.injected_bus("can0").starved == injected
 
 
+@pytest.mark.long
 def test_a_rogue_master(running: Running) -> None:
     before = running.frames.copy()
     host = running.host.stats().buses["can0"].sent

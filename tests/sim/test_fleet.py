@@ -186,6 +186,7 @@ def test_patches_sit_on_their_own_buses() -> None:
         assert not fleet.failed
 
 
+@pytest.mark.long
 def test_all_buses_stop_at_the_same_time() -> None:
     """A node thread notices the end within 0.1 s; ten threads, one after the other, would take a second."""
     with VirtualClock() as virtual:

@@ -358,6 +358,7 @@ def test_a_large_press_leaves_the_mean_threshold_and_does_not_depend_on_its_rate
 TIMES = st.lists(st.floats(0.0, 6.0), min_size=1, max_size=6)
 
 
+@pytest.mark.long
 @given(times=TIMES)
 @settings(max_examples=15, deadline=None)
 def test_the_order_of_evaluation_does_not_matter(times: list[float]) -> None:
@@ -372,6 +373,7 @@ def test_the_order_of_evaluation_does_not_matter(times: list[float]) -> None:
         assert seen.resistance_ohm(t_s, SCENE.upper_m).tobytes() == found[t_s]
 
 
+@pytest.mark.long
 def test_a_time_long_ago_gives_the_same_bytes() -> None:
     """Longer ago than any state of the history that is kept."""
     skin = PhysicalPatch(LAYOUT, Imperfections(creep=(0.1, 0.1), creep_s=(1.0, 1e4), hysteresis=0.1))

@@ -116,6 +116,7 @@ def test_the_truth_of_a_scene_is_what_the_node_measures() -> None:
         np.testing.assert_allclose(patch.exact_ohm(t_ns), expected_ohm, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("period_ms", some_long([100, 700], 100))  # frames of 700 ms have little in common
 def test_the_host_is_right_about_an_ordinary_patch(period_ms: int) -> None:
     """With stated tolerances, fields are trusted, and 1 value in 1000 at most is beyond five deviations."""

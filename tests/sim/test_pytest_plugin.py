@@ -119,6 +119,7 @@ def test_the_same_suite_in_virtual_and_in_real_time(in_virtual_time: Run, tmp_pa
         assert bool(skipped) == ("--skin-bus is virtual" in done.stdout)
 
 
+@pytest.mark.long
 def test_what_a_failure_keeps(in_virtual_time: Run) -> None:
     tmp_path, done = in_virtual_time
     folder = tmp_path / "skin-kept" / "test_grip.py_test_that_fails"
@@ -133,6 +134,7 @@ def test_what_a_failure_keeps(in_virtual_time: Run) -> None:
     assert (folder / "scene.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_a_scene_of_faults_is_kept_without_a_plot(tmp_path: Path) -> None:
     (tmp_path / "faults.toml").write_text("[[faults]]\nwhere = 'palm'\nfault = 'frozen'\n")
     (tmp_path / "test_faults.py").write_text(
@@ -142,6 +144,7 @@ def test_a_scene_of_faults_is_kept_without_a_plot(tmp_path: Path) -> None:
     assert "test_faults.py_test_fails: trace.log, truth.npz, scene.json\n" in printed
 
 
+@pytest.mark.long
 def test_a_failed_set_up_is_kept(tmp_path: Path) -> None:
     (tmp_path / "test_early.py").write_text(
         "import pytest\n\n\n@pytest.fixture\ndef ready(skin_hand):\n    skin_hand('hand.toml')\n"
@@ -157,6 +160,7 @@ def test_a_failed_set_up_is_kept(tmp_path: Path) -> None:
 EXAMPLE = str(Path(__file__).parents[2] / "examples" / "hand.toml")
 
 
+@pytest.mark.long
 def test_a_shipped_scene_is_played_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "test_named.py").write_text(
         f"def test_named(skin_hand, skin_clock):\n    skin_hand({EXAMPLE!r}, scene='taps')\n\n\n"
@@ -167,6 +171,7 @@ def test_a_shipped_scene_is_played_by_its_name(tmp_path: Path) -> None:
     assert "ConfigError: scene: got 'tabs', allowed: a scene file, or one of faults, press, taps" in printed
 
 
+@pytest.mark.long
 def test_bad_use_is_one_line(tmp_path: Path) -> None:
     done = run(tmp_path, "--skin-bus=wireless")
     assert done.returncode == 4

@@ -79,6 +79,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[
     return folder, trace.text(), truths
 
 
+@pytest.mark.long
 def test_the_trace_is_that_of_the_bus(recorded: tuple[Path, str, Any]) -> None:
     folder, text, _ = recorded
     found, expected = (folder / TRACE).read_text().split(), text.replace(" can0 ", " left_hand ").split()

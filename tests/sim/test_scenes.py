@@ -102,6 +102,7 @@ def test_an_electrode_under_the_body_moves_as_the_body() -> None:
         assert -moved == pytest.approx(DEPTH_M - height, rel=0.005)
 
 
+@pytest.mark.long
 def test_a_thin_bonded_film() -> None:
     """An incompressible film: δ − r²/2R = −t³/(3G) ∇²p (Johnson, section 5.8), so F = π G a⁶ / (32 R t³)."""
     contact_m, film_m = 1e-3, 25e-6
@@ -121,6 +122,7 @@ def test_a_flat_punch() -> None:
     assert -contact.force_n[2] == pytest.approx(2 * 2e-3 * 1e6 / 0.75 * 1e-5, rel=0.01)
 
 
+@pytest.mark.long
 def test_a_long_ridge() -> None:
     """The middle of a cylinder has the pressure of a line contact, whose peak is √(E* P' / (π R))."""
     body = {"shape": "ridge", "radius_m": 5e-3, "length_m": 25e-3, "friction": 0.0}
@@ -160,6 +162,7 @@ def test_the_edge_of_a_box() -> None:
     assert extent[1] < 3e-3
 
 
+@pytest.mark.long
 def test_force_is_the_integral_of_the_pressure_at_any_time(slide: PatchScene) -> None:
     for t in np.linspace(0.0, 2.3, 37):
         truth = slide.truth(float(t))
@@ -282,6 +285,7 @@ def test_a_harder_press_within_a_touch() -> None:
     assert -scene.truth(0.95).wrench[2] == pytest.approx(1.5, rel=0.005)
 
 
+@pytest.mark.long
 def test_times_can_be_asked_in_any_order(slide: PatchScene) -> None:
     """Two scenes made from the same tables agree to the byte, whichever time comes first."""
     touch = slide.histories[0].touch.model_dump(exclude_none=True)
@@ -298,6 +302,7 @@ def test_times_can_be_asked_in_any_order(slide: PatchScene) -> None:
         )
 
 
+@pytest.mark.long
 def test_a_touch_is_computed_once_for_the_same_skin_and_body() -> None:
     """Tests of a program start the same scene again and again."""
     first, again = (sphere({"depth_m": 1e-4}, friction=0.3) for _ in range(2))
@@ -497,6 +502,7 @@ def test_the_command_reports_a_bad_scene(tmp_path: Path, capsys: pytest.CaptureF
     assert "only with --scene" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_preview_is_a_png(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "hand.toml").write_text(HAND)
     (tmp_path / "scene.toml").write_text(BODY + TOUCH)

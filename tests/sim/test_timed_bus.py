@@ -79,6 +79,7 @@ def arbitration_bits(frame: CanFrame) -> str:
     return head(frame)[0][1 : 33 if frame.extended else 14]
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=200)
 @given(st.lists(FRAMES, min_size=2, max_size=12, unique_by=arbitration_bits))
 def test_the_lowest_bits_win(frames: list[CanFrame]) -> None:
@@ -200,6 +201,7 @@ def traffic(draw_of: st.DrawFn) -> list[tuple[int, int, CanFrame]]:
     return sent
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=100)
 @given(traffic(), st.lists(st.integers(0, 2_000_000), max_size=20), st.sampled_from(["fifo", "priority"]))
 def test_every_frame_is_delivered_once_and_steps_of_time_do_not_matter(
@@ -277,6 +279,7 @@ def test_a_frame_within_a_bit_of_the_start_interrupts_a_burst() -> None:
     assert [event.frame.can_id for event in delivered(bus)] == [0x200, 0x100, 0x200, 0x200]
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=100)
 @given(traffic(), st.integers(0, 3_000_000), st.integers(1, 3_000_000))
 def test_load_of_any_interval(sent: list[tuple[int, int, CanFrame]], start: int, length: int) -> None:

@@ -82,6 +82,7 @@ def naive_retry_bits(frame: CanFrame, bit: int) -> tuple[int, int, bool]:
     return (nominal, fast + lag, False) if drawn.at_data_rate[bit] else (nominal + lag, fast, place == bit)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=300)
 @given(
     st.integers(0, 0x7FF),
@@ -162,6 +163,7 @@ def test_station_that_is_not_there_disturbs_nothing() -> None:
 # --- counters
 
 
+@pytest.mark.long
 def test_alone_on_the_bus() -> None:
     """No acknowledgement: error-passive after 16 attempts, and never bus-off."""
     bus, drawn = bus_of(1), draw(FRAME)

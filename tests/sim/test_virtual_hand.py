@@ -70,6 +70,7 @@ def run(hash_seed: int, *scenes: str, before: str = "") -> tuple[list[str], str]
     return done.stdout.splitlines(), done.stderr
 
 
+@pytest.mark.long
 def test_two_runs_with_one_seed_are_identical_and_with_another_seed_are_not() -> None:
     """In two processes whose sets have other orders, and whose system clocks other speeds."""
     (first, begin, other, _), said = run(0, "1", "2")

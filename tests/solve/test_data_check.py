@@ -57,6 +57,7 @@ def spoil(kind: str, frame: Float, rest: Float) -> None:
 PLACES = {"crossing": (4, 13), "lower wire open": (None, 13), "upper wire open": (4, None)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("noise", "seed"), some_long([(3e-6, 0), *((NOISE, seed) for seed in range(4))], (NOISE, 0))
 )
@@ -106,6 +107,7 @@ def test_wrong_readings_under_a_press_are_named_and_the_rest_goes_on(kind: str, 
     assert all(4 < since <= 4 + FRAMES for since in first.values())
 
 
+@pytest.mark.long
 def test_a_fault_is_named_although_the_deadline_never_leaves_time_to_examine_it(monkeypatch) -> None:
     """Until then, no field with the wrong reading is trusted; afterwards all are."""
     monkeypatch.setattr(examination_time, "perf_counter", lambda: time.perf_counter() + 10.0)
@@ -138,6 +140,7 @@ def test_a_patch_that_keeps_still_is_examined_when_there_is_time(monkeypatch) ->
     assert [fault.upper for fault in field.faults] == [4]
 
 
+@pytest.mark.long
 def test_named_readings_that_agree_again_are_admitted() -> None:
     rng = np.random.default_rng(4)
     tracker = sk.Tracker(LAYOUT, method="posterior", relative_noise=NOISE)

@@ -153,6 +153,7 @@ def test_discs_reduce_the_error_of_small_bodies_and_its_claim(skin):
     assert claims["discs"] < claims["cells"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", some_long(["sphere", "punch", "ridge", "edge"], "sphere"))
 def test_errors_on_a_bonded_layer_are_within_the_claim(skin, family):
     """The simulator solves the contact; its skin moves sideways and much less far than a half-space."""
@@ -247,6 +248,7 @@ def relative_error(field: sk.FieldFrame, truth: np.ndarray) -> float:
     return float(np.linalg.norm(field.displacement_m - truth) / np.linalg.norm(truth))
 
 
+@pytest.mark.long
 def test_discs_are_fitted_again_as_earlier_frames_reduce_the_noise_of_a_held_press(skin):
     """The truth is a sphere in closed form; the mean of n frames has the noise of one frame over √n."""
     sigma, frames, inside, count = 1e-3, 24, 0, 0

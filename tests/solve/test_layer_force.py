@@ -42,6 +42,7 @@ def test_a_thick_layer_is_a_half_space():
     assert stiffening(2e-3, 1.0) == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 @pytest.mark.parametrize("layer_mm", some_long([2, 4, 8, 16], 4))
 def test_five_deviations_reach_the_force_of_a_bonded_layer(layer_mm, method):

@@ -33,6 +33,7 @@ def traced() -> Iterator[Callable[[], float]]:
     tracemalloc.stop()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", some_long(["exact", "posterior"], "posterior"))
 def test_a_further_patch_of_a_layout_takes_little_memory(traced, method):
     layout = sk.PatchLayout.preset("staggered")

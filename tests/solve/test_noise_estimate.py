@@ -180,6 +180,7 @@ def test_results_of_rightly_stated_noise_stay_to_the_last_bit(small: sk.PatchLay
         np.testing.assert_array_equal(field.displacement_std_m, expected.displacement_std_m)
 
 
+@pytest.mark.long
 def test_auto_changes_to_the_posterior_while_the_noise_is_too_large_for_the_exact_inverse(
     staggered: sk.PatchLayout, rest: np.ndarray
 ) -> None:

@@ -99,6 +99,7 @@ SETTINGS = [  # layout, noise, least share in 95 % intervals; a ridge under much
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", some_long(["sphere", "gauss", "ridge", "plateau"], "sphere", "plateau"))
 @pytest.mark.parametrize(("name", "sigma", "least"), some_long(SETTINGS, SETTINGS[1]))
 def test_reported_deviations_and_intervals_hold(name, sigma, least, kind):
@@ -427,6 +428,7 @@ def test_normal_only_is_the_sharper_one_where_nothing_shears(staggered):
             assert one.displacement_std_m[..., 2].mean() < 0.7 * both.displacement_std_m[..., 2].mean()
 
 
+@pytest.mark.long
 def test_what_is_held_is_as_right_as_what_is_solved(staggered):
     """Two trackers on one stream with pauses; a held frame costs no factorisation."""
     rng = np.random.default_rng(12)
@@ -647,6 +649,7 @@ def digest(fields: list[sk.FieldFrame], covariance: np.ndarray) -> str:
     return whole.hexdigest()
 
 
+@pytest.mark.long
 def test_threads_do_not_change_a_bit(staggered):
     frames = scenes(staggered)
     found = [""] * 4
@@ -775,6 +778,7 @@ def test_a_bad_frame_is_not_put_down_to_the_model(staggered):
         assert np.abs(deviations(field, moved)).max() < 5
 
 
+@pytest.mark.long
 def test_a_slide_under_an_uncertain_model_is_followed(staggered):
     """The common model error stays small, though it could take the place of much of the displacement."""
     rng = np.random.default_rng(22)

@@ -46,6 +46,7 @@ def test_a_healthy_patch_at_its_stated_noise_is_precise(skin: Skin, noise: float
     assert [field.precise for field in stream(skin, noise, tracker)] == [True] * 5
 
 
+@pytest.mark.long
 def test_a_patch_made_to_ordinary_tolerances_is_precise() -> None:
     skin = skin_of()
     tracker = sk.Tracker(

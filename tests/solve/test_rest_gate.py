@@ -160,6 +160,7 @@ def test_codes_that_change_in_place_are_decoded_again() -> None:
         assert one.touch_odds == other.touch_odds
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("timed", some_long([True, False], True))
 def test_drift_during_a_gap_is_no_touch_if_the_times_are_known(timed: bool) -> None:
     """The scans pause for eight hours, in which the gain of each wire changes by 3 %, up or down."""

@@ -252,6 +252,7 @@ def test_a_jump_at_a_random_time_has_the_stated_mean_and_at_most_the_stated_vari
     assert (variance[1:] >= 0.5 * np.mean(np.square(claims), axis=0)[1:]).all()
 
 
+@pytest.mark.long
 def test_a_motion_that_starts_at_a_random_time_has_at_most_the_stated_variance():
     rng = np.random.default_rng(6)
     row_s = 0.9 * PERIOD_S / len(WIRES)

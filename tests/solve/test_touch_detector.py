@@ -90,6 +90,7 @@ def test_a_tap_of_one_scan_is_found() -> None:
         assert changes(touched) == [True, False]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("drift", some_long(["steady", "walk"], "walk"))
 @pytest.mark.parametrize("noise", some_long([1e-3, 1e-5], 1e-5))
 def test_a_press_held_for_ten_minutes_stays_touched(noise: float, drift: str) -> None:
@@ -124,6 +125,7 @@ def test_creep_after_a_release_ends(noise: float) -> None:
     assert stream.see(sphere(0.05), 10)[-1]
 
 
+@pytest.mark.long
 def test_an_hour_of_drift_is_not_a_touch() -> None:
     stream = Stream()
     assert not any(stream.see(REST, 20_000))  # 27 minutes

@@ -64,6 +64,7 @@ def scans(ticks: list[Tick]) -> list[tuple[str, int]]:
     return [(name, field.stamp.scan) for tick in ticks for name, field in tick.fields.items() if field.stamp]
 
 
+@pytest.mark.long
 def test_a_fast_drawing_shows_every_field_once() -> None:
     ticks: list[Tick] = []
     with drawn(ticks.append, rate_hz=200.0) as (_, fleet, thread, every):
@@ -75,6 +76,7 @@ def test_a_fast_drawing_shows_every_field_once() -> None:
     assert (thread.counts.drawn, thread.counts.left_out, thread.counts.dropped) == (len(published), 0, 0)
 
 
+@pytest.mark.long
 def test_no_more_than_thirty_pictures_a_second_and_the_rest_are_counted() -> None:
     ticks: list[Tick] = []
     with drawn(ticks.append) as (_, fleet, thread, every):  # 40 SYNCs per second
@@ -92,6 +94,7 @@ def test_no_more_than_thirty_pictures_a_second_and_the_rest_are_counted() -> Non
     assert scans(ticks)[-2:] == published[-2:]  # the newest is never left out
 
 
+@pytest.mark.long
 def test_a_drawing_that_blocks_loses_fields_and_the_host_none() -> None:
     ticks: list[Tick] = []
 
@@ -142,6 +145,7 @@ def test_events_are_drawn_once() -> None:
     assert shown == expected
 
 
+@pytest.mark.long
 def test_a_drawing_that_fails_ends_alone() -> None:
     def draw(tick: Tick) -> None:
         raise OSError("no space left on device")
@@ -156,6 +160,7 @@ def test_a_drawing_that_fails_ends_alone() -> None:
     assert "no space left on device" in str(thread.failure)
 
 
+@pytest.mark.long
 def test_a_patch_that_supplies_its_electrodes_is_drawn_with_them(tmp_path: Path) -> None:
     """Twice as wide as planned; live, by the drawing of a recording, and by its replay."""
     plan = a_hand(patches=1, solver={"method": "exact"})

@@ -201,6 +201,7 @@ def changes_in(fields: list[FieldFrame]) -> list[tuple[int, str, str]]:
     return found
 
 
+@pytest.mark.long
 def test_a_conversion_draws_every_field_in_the_time_of_the_recording(recording: Path) -> None:
     ticks: list[Tick] = []
     conversion = Conversion(recording)
@@ -233,6 +234,7 @@ def test_a_conversion_draws_every_field_in_the_time_of_the_recording(recording: 
     assert (gaps < 3.3e8).all()  # with the check every 50 ms and a SYNC every 25 ms
 
 
+@pytest.mark.long
 def test_the_events_of_a_replay_are_complete_when_it_is_over(
     recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,6 +296,7 @@ def test_convert_draws_as_view_does_unless_told_otherwise(recording: Path, tmp_p
     assert (again.returncode, "allowed: a new file; this one already exists" in again.stderr) == (2, True)
 
 
+@pytest.mark.long
 def test_a_damaged_recording_is_converted_as_far_as_it_goes(
     recording: Path, tmp_path: Path, sdk: None
 ) -> None:

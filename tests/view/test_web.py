@@ -139,6 +139,7 @@ def test_a_browser_that_leaves_disturbs_nobody(files: int, capfd: pytest.Capture
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("address", "in_url"), [("127.0.0.2", "127.0.0.2"), ("::1", "[::1]")])
 def test_a_page_on_one_address_of_this_computer_has_its_files_from_there(
     address: str, in_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -83,6 +83,7 @@ def test_where_stalls_count_it_fails(tmp_path: Path) -> None:
     assert "and counted" in output
 
 
+@pytest.mark.long
 def test_one_that_fails_by_itself_is_not_run_again(tmp_path: Path) -> None:
     for _ in range(5):  # on a busy machine, a real stall may hit the third test
         status, output = run(tmp_path, "-n", "0", third=False)

@@ -23,6 +23,12 @@ from skinnode.host.solve_rate import SolveRate
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 
 
+@pytest.fixture(autouse=True)
+def _few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most tests do not depend on how long a scan takes to solve, so it is measured in two frames."""
+    monkeypatch.setattr(skinnode.host.solve_rate, "FRAMES", 2)
+
+
 def command(*arguments: str) -> Result:
     return CliRunner().invoke(app, ["hand", *arguments])
 

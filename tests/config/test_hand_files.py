@@ -91,6 +91,7 @@ def paths(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [found for key, inner in items for found in ((*path, key), *paths(inner, (*path, key)))]
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(st.dictionaries(KEY, VALUE, max_size=5))
 def test_every_key_of_any_document_has_its_place(table: dict[str, Any]) -> None:

@@ -295,6 +295,7 @@ def test_a_lost_answer_to_a_tare_is_no_operational_patch(running: Running) -> No
     running.assert_back()
 
 
+@pytest.mark.long
 def test_a_host_that_is_restarted_finds_its_nodes_running(make_hand: Callable[..., HandConfig]) -> None:
     hand = make_hand(sync={"period_ms": 50})
     with Fleet(hand) as fleet:

@@ -281,6 +281,7 @@ def test_host_that_dies_is_followed_by_another(
         assert discrepancies(host.stats()) == []
 
 
+@pytest.mark.long
 def test_frozen_values(make_hand: Callable[..., HandConfig]) -> None:
     hand = make_hand(simulation={"cycle_s": 60.0})
     with Fleet(hand) as fleet, Host.from_config(hand) as host:

@@ -375,6 +375,7 @@ def held_up_until(source: Busy, said: Callable[[], bool]) -> bool:
     return False
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer that is too slow for its nodes is no fault of the skin."""

@@ -100,6 +100,7 @@ def test_field_agrees_with_the_truth_within_what_it_claims(make_hand: Callable[.
     assert 0.7 < float(np.sqrt(np.mean(scores))) < 1.4
 
 
+@pytest.mark.long
 def test_discs_reduce_the_error_of_a_noisy_patch() -> None:
     """The key ``solver.prior`` of the hand file reaches the solver."""
     error_m = {}

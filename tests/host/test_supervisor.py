@@ -113,6 +113,7 @@ def reset_by(host: Host, patch: str) -> bool:
     return eventually(lambda: host.stats().nodes[patch].rejoins == rejoins + 1)
 
 
+@pytest.mark.long
 def test_resets_that_the_host_commands_are_no_restart_loop(
     hand: HandConfig, rack: Rack, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -98,6 +98,7 @@ def as_an_older_version_wrote_it(path: Path, folder: Path) -> Path:
     return copy
 
 
+@pytest.mark.long
 def test_a_recording_that_lacks_a_layout_file_is_not_solved_with_another_layout(
     recorded: Recorded, tmp_path: Path
 ) -> None:
@@ -165,6 +166,7 @@ def guest_of(hand: HandConfig, journal: Path, period_ms: int) -> HandConfig:
     return parse_hand(table, folder=journal.parent)
 
 
+@pytest.mark.long
 def test_the_recording_of_a_guest_that_sends_nothing_is_replayed(tmp_path: Path) -> None:
     """80 ms is the default period, but a guest must give it."""
     table = a_hand().model_dump(mode="json", exclude_defaults=True) | {"sync": {"period_ms": 80}}

@@ -177,6 +177,7 @@ def decoded(path: Path) -> list[Any]:
         return list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
 
 
+@pytest.mark.long
 def test_mcap_ros2_support_reads_every_message_that_rosbags_reads(run: Any) -> None:
     path, *_ = run
     ours: Counter[str] = Counter()
@@ -312,6 +313,7 @@ def read_by_the_library(path: Path) -> int:
     return messages
 
 
+@pytest.mark.long
 def test_a_file_cut_anywhere_gives_every_whole_chunk(tmp_path: Path) -> None:
     whole, path = written(tmp_path / "x.mcap", 500), tmp_path / "cut.mcap"
     rng = random.Random(3)
@@ -350,6 +352,7 @@ def test_garbage_costs_the_chunks_that_it_covers(tmp_path: Path) -> None:
         assert numbers == sorted(set(numbers))
 
 
+@pytest.mark.long
 def test_whatever_is_in_a_file_nothing_but_one_line_is_raised(tmp_path: Path) -> None:
     whole, path = written(tmp_path / "x.mcap", 120, 30), tmp_path / "y.mcap"
     refusals: list[str] = []
@@ -558,6 +561,7 @@ def test_a_copy_with_frames_only_has_no_messages_of_another_kind(tmp_path: Path,
     assert bits(replay(small)) == bits(replay(path))
 
 
+@pytest.mark.long
 def test_a_repaired_recording_knows_that_a_part_is_missing_inside(tmp_path: Path, run: Any) -> None:
     """The numbers of frames in its journal no longer hold, so its events take effect by their times."""
     bad, good = tmp_path / "bad.mcap", tmp_path / "good.mcap"

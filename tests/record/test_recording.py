@@ -215,6 +215,7 @@ def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent
     assert played.flaws == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("jump_s", some_long([3600.0, -3600.0, 0.5], -3600.0))
 def test_times_in_a_recording_that_jump(tmp_path: Path, jump_s: float) -> None:
     """A clock that was set by whoever wrote the log: the scan it falls into is lost, nobody waits an hour."""

@@ -89,6 +89,7 @@ def test_the_trace_is_that_of_the_bus(recorded: tuple[Path, str, Any]) -> None:
     assert channels_in(folder / TRACE) == ["left_hand"]
 
 
+@pytest.mark.long
 def test_the_truth_of_each_scan(recorded: tuple[Path, str, dict[int, Any]]) -> None:
     folder, _, truths = recorded
     with np.load(folder / TRUTH) as file:

@@ -177,6 +177,7 @@ def test_force_is_the_integral_of_the_pressure_at_any_time(slide: PatchScene) ->
         np.testing.assert_allclose(truth.wrench[:3], total, atol=1e-12)
 
 
+@pytest.mark.long
 def test_wrench_is_that_of_the_tractions(slide: PatchScene) -> None:
     truth = slide.truth(1.1)
     (contact,) = truth.contacts
@@ -210,6 +211,7 @@ def test_the_depth_of_a_force_is_found_however_steeply_the_force_begins(
     assert depth == pytest.approx(exact, rel=2e-4) or force_n(depth) == pytest.approx(target, rel=0.01)
 
 
+@pytest.mark.long
 def test_a_force_ramps_up_from_nothing_on_a_few_cells() -> None:
     truth = sphere({"force_n": 4.0, "ramp_s": 0.5, "to_s": 2.0}, friction=0.3).truth(1.0)
     assert truth.wrench[2] == pytest.approx(-4.0, rel=0.01)
@@ -234,6 +236,7 @@ def test_a_press_is_symmetric() -> None:
     np.testing.assert_allclose(np.moveaxis(moved, 0, 1)[..., [1, 0, 2]], moved, atol=2e-4 * scale)
 
 
+@pytest.mark.long
 def test_a_rolling_sphere_has_less_shear_than_a_sliding_one() -> None:
     def shear_n(kind: str) -> float:
         motion = {"kind": kind, "by_m": [4e-3, 0.0], "from_s": 0.3, "to_s": 0.9}
@@ -514,6 +517,7 @@ def test_the_preview_is_a_png(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_a_scene_reaches_the_host() -> None:
     """Through the real nodes: the depth that the host decodes is the depth of the truth."""
     plan = hand(2, upper_wires=5, upper_electrodes=5)

@@ -233,6 +233,7 @@ def test_interpolation_never_leaves_the_two_scans_nor_understates_their_noise(se
     assert (found.displacement_std_m >= (1.0 - 1e-12) * least).all()
 
 
+@pytest.mark.long
 def test_a_jump_at_a_random_time_has_the_stated_mean_and_at_most_the_stated_variance():
     rng = np.random.default_rng(3)
     row_s = 0.9 * PERIOD_S / len(WIRES)

@@ -173,6 +173,7 @@ def test_drift_while_no_scan_is_usable_is_no_touch(lost: bool) -> None:
     assert not any(touched)
 
 
+@pytest.mark.long
 def test_noise_that_is_not_as_stated_is_neither_a_touch_nor_hides_one() -> None:
     """From 0.7 to 1.4 times the stated noise, where the noise estimate of the tracker does not act."""
     for factor in (0.7, 1.4):

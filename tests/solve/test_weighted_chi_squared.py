@@ -26,6 +26,7 @@ def test_pairs_of_weights_are_a_sum_of_exponentials() -> None:
         assert tail_probability(np.repeat(single, 2), x) == pytest.approx(exact, rel=0.03)
 
 
+@pytest.mark.long
 def test_quantiles_of_a_typical_test_agree_with_a_simulation() -> None:
     rng = np.random.default_rng(1)
     weights = 1.0 / (1.0 + np.linspace(0.0, 6.0, 60) ** 2)

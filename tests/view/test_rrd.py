@@ -259,6 +259,7 @@ def view(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.long
 def test_the_command_converts_a_recording(recording: Path, tmp_path: Path, sdk: None) -> None:
     path = tmp_path / "run.rrd"
     done = view("--replay", str(recording), "--save", str(path), "--exaggerate", str(EXAGGERATION))
@@ -279,6 +280,7 @@ def test_the_command_converts_a_recording(recording: Path, tmp_path: Path, sdk: 
     assert len(Rows(path).of) == len(rows.of)  # and is as it was
 
 
+@pytest.mark.long
 def test_convert_draws_as_view_does_unless_told_otherwise(recording: Path, tmp_path: Path, sdk: None) -> None:
     drawn, converted = tmp_path / "drawn.rrd", tmp_path / "converted.rrd"
     view("--replay", str(recording), "--save", str(drawn))

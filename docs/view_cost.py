@@ -1,12 +1,12 @@
-"""Measure the cost of `skinnode view` for 16 patches on four CAN FD buses at 40 SYNCs per second.
+"""Measure the cost of `skinnode view` for 16 patches on four CAN FD buses at 30 SYNCs per second.
 
-    python docs/view_cost.py [SECONDS] [rest]
+    python docs/view_cost.py [SECONDS [TOUCHED]]
 
-The load is the same as in `skinnode bench pipeline`: a child process replays the frames of a touched hand
-over UDP, or with `rest` those of an untouched hand. The script alternates between runs without a view and
-runs with a view that writes to the browser's data server. The host runs on one core; the generator, the
-drawing and the data server run on another. If permitted, the generator has real-time priority: frames that it
-sends late would look like a slow host.
+As in `skinnode bench pipeline`, a child process replays the frames of a hand over UDP. The first TOUCHED
+patches are pressed and stroked: 4 by default. The script alternates between runs without a view and runs with
+a view that writes to the browser's data server. The host runs on one core; the generator, the drawing and the
+data server run on another. If permitted, the generator has real-time priority, because frames that it sends
+late would look like a slow host.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from skinnode.view.outputs import OutputOptions, open_output
 from skinnode.view.viewer_process import free_port
 
 ROUNDS: Final = 5
+PERIOD_MS: Final = 33
 
 
 def cpu_s(name: str) -> float:
@@ -87,16 +88,18 @@ def measure(hand: Any, generator: Generator, core: int, seconds: float, *, viewe
 
 def main() -> None:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
+    touched = int(sys.argv[2]) if len(sys.argv) > 2 else 4
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[:1])
     rows: dict[bool, list[dict[str, float]]] = {False: [], True: []}
     print(f"load average {os.getloadavg()[0]:.1f}")
     with tempfile.TemporaryDirectory() as folder:
         hand = full_hand(4, True, 3.0, "udp", "", Path(folder), one_worker=True)
+        hand = hand.model_copy(update={"sync": hand.sync.model_copy(update={"period_ms": PERIOD_MS})})
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         with (
-            closing(Generator(hand, seconds, touched="rest" not in sys.argv, core=cores[-1])) as generator,
+            closing(Generator(hand, seconds, touched=touched, core=cores[-1])) as generator,
             without_long_collections(),
         ):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -25,9 +25,9 @@ from xdist.scheduler import LoadScopeScheduling
 
 from . import warm_up
 
-WORKERS = 4
-"""Processes for the whole suite. On two processors, the suite took 455 s with seven processes and 386 s with
-four: each imports all modules, and most tests compute rather than wait."""
+WORKERS = 5
+"""Processes for the whole suite. On two processors, the suite took 216 s with five and 227 s with four: each
+imports all modules, and most tests compute rather than wait."""
 
 REAL_TIME = "real_time"
 """Marker and group of the tests that count frames in real time and would disturb each other."""

@@ -67,11 +67,11 @@ class Generator:
     Args:
         hand: Hand to replay.
         seconds: Duration of the traffic, in s.
-        touched: If True, all patches are pressed and stroked as in the demo; if False, none is touched.
+        touched: Number of patches that are pressed and stroked as in the demo: the first of the hand; None for all.
         core: Processor core to which the process is bound; None for no binding.
     """
 
-    def __init__(self, hand: HandConfig, seconds: float, *, touched: bool, core: int | None) -> None:
+    def __init__(self, hand: HandConfig, seconds: float, *, touched: int | None, core: int | None) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
         self._process = spawn.Process(target=_serve, args=(theirs, hand, seconds, touched, core), daemon=True)
@@ -114,7 +114,7 @@ class Generator:
         return answer
 
 
-def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, core: int | None) -> None:
+def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: int | None, core: int | None) -> None:
     try:
         if core is not None:
             os.sched_setaffinity(0, {core})
@@ -143,7 +143,7 @@ class Stream:
     load: float
 
 
-def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool = True) -> Stream:
+def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: int | None = None) -> Stream:
     """Simulate ``seconds`` of operation and return all frames on ``bus``, including SYNC."""
     scans = round(seconds / hand.sync.period_s)
     late_ns = round([each.name for each in hand.buses].index(bus.name) * hand.sync.stagger_s * 1e9)
@@ -151,7 +151,7 @@ def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool
     queues = [syncs]
     for number, patch in enumerate(hand.patches):
         if patch.bus == bus.name:
-            queues.append(_node_frames(hand, patch, number, syncs, touched))
+            queues.append(_node_frames(hand, patch, number, syncs, touched is None or number < touched))
     frames = [(*frame, queue) for queue, frames in enumerate(queues) for frame in frames]
     durations = _durations_ns(bus, [frame[:4] for frame in frames])
     return _arbitrate(frames, durations)

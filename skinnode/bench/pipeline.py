@@ -102,7 +102,7 @@ def run(  # noqa: PLR0913 - the options of the command
             fewer = [buses for buses in (1, 2) if buses < fullest and plain]
             core = cores[-1] if apart else None
             with (
-                closing(Generator(hand, seconds, touched=touched, core=core)) as generator,
+                closing(Generator(hand, seconds, touched=None if touched else 0, core=core)) as generator,
                 without_long_collections(),
             ):
                 for buses in (*fewer, fullest):

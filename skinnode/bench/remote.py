@@ -62,7 +62,7 @@ def run(seconds: float, *, publish_only: bool, report: Callable[[Row], None]) ->
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         hand = full_hand(BUSES, True, STAGGER_MS, "udp", "", Path(folder), one_worker=False)
-        with closing(Generator(hand, seconds / rounds, touched=True, core=None)) as generator:
+        with closing(Generator(hand, seconds / rounds, touched=None, core=None)) as generator:
             for _ in range(rounds):
                 rows.append(_measure(hand, generator, connected=not publish_only))
                 report(rows[-1])

@@ -11,11 +11,13 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
-from skinnode.model.frames import FieldFrame, amended
+from skinnode.model.frames import FieldFrame, SolveStats, amended
 from skinnode.process.child_processes import starting_children
 from skinnode.process.closing import Closing
 from skinnode.view.outputs import Target
@@ -25,6 +27,14 @@ _NICE: Final = 10
 """Increment added to the child process's nice value."""
 _END_S: Final = 8.0
 """Time limit for writing the pending data on closing, in s."""
+
+_NOT_DRAWN: Final[dict[str, Any]] = {
+    **dict.fromkeys(("force_n", "gain", "core_std_m", "data_share", "by_prior", "held")),
+    **dict.fromkeys(("residual", "wires_trusted"), np.empty(0)),  # the same object is pickled once
+    "stats": SolveStats(0, 0, 0, 0.0),
+    "status": (),
+}
+"""Attributes of a field that the child process does not need, and their values there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +104,8 @@ class DrawingProcess(Closing):
 
 
 def _slim(field: FieldFrame) -> FieldFrame:
-    """Return the field without the arrays that are not drawn, because copying them takes time."""
-    return amended(field, force_n=None, gain=None, core_std_m=None, data_share=None, by_prior=None, held=None)
+    """Return the field with only what is drawn, because pickling it holds the interpreter lock."""
+    return amended(field, **_NOT_DRAWN)
 
 
 def _run(hand: HandConfig, target: Target, options: DrawingOptions, parent: Connection) -> None:

@@ -67,7 +67,7 @@ class Generator:
     Args:
         hand: Hand to replay.
         seconds: Duration of the traffic, in s.
-        touched: Number of patches that are pressed and stroked as in the demo: the first of the hand; None for all.
+        touched: Number of patches that are pressed and stroked as in the demo, the first ones; None for all.
         core: Processor core to which the process is bound; None for no binding.
     """
 

@@ -152,8 +152,8 @@ class Hyperparameters:
         expected = (prior.scale2 * prior.covariance.diagonal()).reshape(std.shape)
         unknown = np.minimum(unseen / expected, 1.0)
         light = self._least * prior.uniform.diagonal().reshape(std.shape) * unknown
-        moved = estimator.free_displacement().reshape(std.shape)
-        share = np.minimum(disc_claim.prior_shares(moved, unknown, self.discs.discs), prior.doubt)
+        share = disc_claim.prior_shares(estimator.moved, estimator.free, unknown, self.discs.discs)
+        share = np.minimum(share, prior.doubt)
         return np.sqrt(std**2 + spread + light), np.sqrt(own + share * unseen + spread)
 
     def with_undetected(self, std: Float) -> Float:

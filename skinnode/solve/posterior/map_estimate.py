@@ -85,6 +85,7 @@ class MapEstimator:
 
     Attributes:
         load_prior: Prior for the loads and of the displacement.
+        free: (f,) indices of the free coordinates of a wire.
         moved: (U, 3N) displacement, in pitches; 0 for fixed coordinates.
         g: The p nuisances, followed by the geometry errors.
         members: Wires whose equations are in the factors.
@@ -106,7 +107,7 @@ class MapEstimator:
         wires, equations = problem.layout.shape
         coordinates = problem.layout.unknowns
         every = (np.arange(wires)[:, None] * coordinates + free).ravel()
-        self._problem, self._free = problem, free
+        self._problem, self.free = problem, free
         self.load_prior = LoadPrior(elastic, every)
         self._geometry = None if tolerances.exact else GeometryError(problem, elastic, tolerances)
         effects = 0 if self._geometry is None else EFFECTS
@@ -267,8 +268,8 @@ class MapEstimator:
         else:
             self._linearise(observation, moved)
         total, top = np.empty((2, len(self.moved)))
-        move = np.empty((len(top), self._free.size))
-        kernels.measure_fit(self._free, observation.h, self.g, self._b.jt, self._b.r, total, top, move)
+        move = np.empty((len(top), self.free.size))
+        kernels.measure_fit(self.free, observation.h, self.g, self._b.jt, self._b.r, total, top, move)
         return Fit(total, top, move)
 
     def objective(
@@ -282,11 +283,11 @@ class MapEstimator:
 
     def roughness(self, moved: Float) -> float:
         """Return uᵀ C⁻¹ u, in pitch², for a displacement u (U, 3N)."""
-        return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
+        return self.load_prior.roughness(np.ascontiguousarray(moved[:, self.free]).ravel())
 
     def free_displacement(self) -> Float:
         """Return the free coordinates (U f,) of the current displacement, in pitches."""
-        return np.ascontiguousarray(self.moved[:, self._free]).ravel()
+        return np.ascontiguousarray(self.moved[:, self.free]).ravel()
 
     def covariance(self) -> Float:
         """Return the posterior covariance (U f, U f) of the displacement, in pitch²."""
@@ -297,12 +298,12 @@ class MapEstimator:
 
     def information(self) -> Float:
         """Return Σ (∂r/∂x)² (U, f), in pitch⁻², from the last linearisation of all wires."""
-        slopes = self._b.jt[:, self._free]
+        slopes = self._b.jt[:, self.free]
         return np.asarray(np.einsum("uik,uik->ui", slopes, slopes))
 
     def whiten(self, response: Float, out: Float) -> None:
         """Write L⁻¹ J G into ``out`` (m, C) for the response G (U f, C), using the current factors."""
-        b, f, rows = self._b, self._free.size, self._rows
+        b, f, rows = self._b, self.free.size, self._rows
         for i, u in enumerate(self.members.tolist()):
             block = slice(i * rows, (i + 1) * rows)
             multiply(b.jacobian[block], response[u * f : (u + 1) * f], out[block])
@@ -339,7 +340,7 @@ class MapEstimator:
 
     def match(self, data: Float, response_t: Float) -> Float:
         """Return (L⁻¹ J G)ᵀ z (C,) for whitened data z (m,) and Gᵀ (C, U f), using the current factors."""
-        b, f, rows = self._b, self._free.size, self._rows
+        b, f, rows = self._b, self.free.size, self._rows
         z = data.copy()
         solve_lower_transposed_vector(b.innovation_covariance, z, z.size)
         gradient = np.zeros(len(self.load_prior.response))
@@ -352,10 +353,10 @@ class MapEstimator:
 
     def signal(self) -> Float:
         """Return the prior variance (U, K) of each relative change in R at rest, for s = 1, in pitch⁻²."""
-        wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
+        wires, f, a = len(self.moved), self.free.size, self._problem.a_rest
         plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
         self._linearise_at_rest(plain)
-        slopes = self._b.jt[:, self._free]  # (U, f, K)
+        slopes = self._b.jt[:, self.free]  # (U, f, K)
         own = self.load_prior.uniform.reshape(wires, f, wires, f)[np.arange(wires), :, np.arange(wires)]
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
@@ -447,7 +448,7 @@ class MapEstimator:
         self._b = b = kernels.with_factors(self._b)
         covariance = self.load_prior.covariance if covariance is None else covariance
         o = observation
-        trace = kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, b)
+        trace = kernels.assemble(members, self.free, covariance, scale2, o.h, o.d, moved, b)
         if self._geometry is not None:
             b.factored_effect[:] = b.effect
             g = self.g[self._fixed :]
@@ -466,7 +467,7 @@ class MapEstimator:
         if not cholesky(b.innovation_covariance, members.size * self._rows):
             return math.inf
         before = self.moved.copy()
-        kernels.gauss_newton_step(members, self._free, observation.d, self.moved, self.g, b)
+        kernels.gauss_newton_step(members, self.free, observation.d, self.moved, self.g, b)
         if self._geometry is not None:
             geometry_error.estimate(members, b.factored_effect, b.v, self.g[self._fixed :])
         size = float(np.abs(self.moved - before).max())
@@ -563,12 +564,12 @@ class MapEstimator:
         for _ in range(CHORDS):
             self._linearise(observation, self.moved, self.members)
             size, top = kernels.chord_step(
-                self.members, self._free, prior.covariance, prior.scale2, observation.h, observation.d,
+                self.members, self.free, prior.covariance, prior.scale2, observation.h, observation.d,
                 self.moved, self.g, step, b,
             )  # fmt: skip
             if not (top <= self._reach and size < math.inf):
                 return False
-            self.moved[:, self._free] += step[: self._no_noise.size].reshape(wires, -1)
+            self.moved[:, self.free] += step[: self._no_noise.size].reshape(wires, -1)
             self.g += step[self._no_noise.size :]
             if self._is_enough(size):
                 return True

@@ -388,8 +388,9 @@ def choose_method(layout: PatchLayout, options: TrackerOptions) -> tuple[str, st
     """
     nuisances, normal_only = options.nuisances, options.normal_only
     if options.method != "auto":
-        if options.method == "exact" and nuisances:
-            raise ValueError(f"method: got 'exact' with {nuisances[0]}, must be posterior or auto")
+        refused = nuisances or ["prior 'discs'"] * (options.prior == "discs")
+        if options.method == "exact" and refused:
+            raise ValueError(f"method: got 'exact' with {refused[0]}, must be posterior or auto")
         return options.method, "requested"
     if nuisances:
         return "posterior", f"{' and '.join(nuisances)} requested"

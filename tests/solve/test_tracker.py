@@ -198,7 +198,12 @@ def test_the_reason_is_the_deviation_that_noise_leaves(sigma):
 
 
 def test_exact_refuses_what_it_cannot_give(layout):
-    for options, name in [({"drift": "patch"}, "drift"), ({"model_error": 0.1}, "model_error")]:
+    refused = [
+        ({"drift": "patch"}, "drift"),
+        ({"model_error": 0.1}, "model_error"),
+        ({"prior": "discs"}, "prior 'discs'"),
+    ]
+    for options, name in refused:
         with pytest.raises(ValueError, match=f"method: got 'exact' with {name}"):
             sk.Tracker(layout, method="exact", **options)
 

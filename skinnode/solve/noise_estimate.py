@@ -232,6 +232,7 @@ class NoiseEstimate:
         self._work = np.empty((2, shape[0] * shape[1]))
         self.reset()
         self._assess()  # compiles the kernel before a stream starts
+        self.reset()
 
     def reset(self) -> None:
         """Discard the state of the stream."""

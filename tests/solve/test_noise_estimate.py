@@ -152,6 +152,17 @@ def test_the_claim_follows_the_noise(small: sk.PatchLayout, method: str, wrong: 
     assert 0.7 < rms < 1.4 if method == "exact" else 0.2 < rms < 1.2
 
 
+def test_a_new_estimate_is_as_one_that_was_reset() -> None:
+    """Or a stream would depend on whether it is the first in its process, which compiles the kernels."""
+    frames = at_rest(np.ones((4, 12)), 1e-4, 40)
+    noise = np.full(frames.shape[1:], 1e-5)
+    new, reset = NoiseEstimate(noise.shape), NoiseEstimate(noise.shape)
+    reset.reset()
+    for frame in frames:
+        assert new.see(frame, noise) == reset.see(frame, noise)
+    assert new.factor == reset.factor != 1.0
+
+
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 def test_held_wires_follow_the_noise(small: sk.PatchLayout, method: str) -> None:
     rest = frame_ohm(small, np.zeros_like(small.upper_m))

@@ -276,6 +276,8 @@ class Hyperparameters:
         change = float(np.abs(estimator.moved - self._fitted).max())
         top = float(np.abs(estimator.moved).max())
         power = float((observation.weight**2).sum())
+        if not power > 0.0:  # no reading is usable
+            return False
         same_noise = REFIT_NOISE**2 <= power / self._fitted_power <= REFIT_NOISE**-2
         known = uniform or self._rough or self._outdated
         if same_noise and not (known or self._has_moved(change, top, estimator.core)):

@@ -16,6 +16,7 @@ from skinnode.bench.trust_loads import LOADS, Bonded, Punch, Ridge, draw
 from skinnode.bench.trust_report import verdicts
 from skinnode.bench.trust_score import Score, judge, rate_bounds
 from skinnode.bench.trust_signal import CodeStream, Setting, Timeline, all_settings, make
+from skinnode.bench.trust_solver import fields_of, host_patch
 from skinnode.bench.truth import RUBBER
 from skinnode.cli.bench import app
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
@@ -396,9 +397,11 @@ def test_wires_found_to_be_exchanged_are_not_forgotten_under_a_deeper_press() ->
 
 
 @pytest.mark.long
-def test_a_stream_with_a_frame_without_readings_is_solved_with_discs() -> None:
+def test_a_stream_with_a_frame_without_readings_is_solved_with_discs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A noisy wire and torn scans leave a frame of a touch without a usable reading: its weights are zero."""
     wanted = ("lower wire noisy", "scans torn")
     item = next(each for each in _bench_trust.items(1, settings=all_settings()) if each.faults == wanted)
-    assert item.setting.noise == 1e-4  # discs by default
+    monkeypatch.setattr(
+        _bench_trust, "fields_of", lambda taken: fields_of(taken, host_patch(taken, prior="discs"))
+    )
     assert _bench_trust.solve_item(item, 1).frames > 0

@@ -268,9 +268,8 @@ def test_a_layout_that_the_host_would_refuse(tmp_path: Path) -> None:
 
 def test_discs_are_recommended_where_they_help(tmp_path: Path) -> None:
     noisy = "relative_noise = 1e-3\n"
-    cells = '[solver]\nprior = "cells"\n'
-    assert 'prior = "auto"' in said(notes(tmp_path, cells + PALM + noisy + TIP), "solver.prior")["palm"]
-    assert not said(notes(tmp_path, PALM + noisy), "solver.prior")
+    assert 'prior = "discs"' in said(notes(tmp_path, PALM + noisy + TIP), "solver.prior")["palm"]
+    assert not said(notes(tmp_path, '[solver]\nprior = "discs"\n' + PALM + noisy), "solver.prior")
 
 
 def test_how_many_scans_can_be_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,7 @@ class SolverConfig(Table):
     prior: Annotated[Prior, one_of(Prior)] = "cells"
     """Loads that the method ``posterior`` expects in a touched patch: independent loads in single ``cells``,
     or loads in a few soft ``discs``. At a noise of 1e-3, the errors with ``discs`` are about half as large,
-    and a scan takes up to 1.8 times as long. The method ``exact`` expects no loads and refuses ``discs``."""
+    and a scan takes 0.7 to 1.2 times as long. The method ``exact`` expects no loads and refuses ``discs``."""
     past: Annotated[Past, one_of(Past)] = "auto"
     """Use earlier scans: with ``auto``, the method ``posterior`` combines each scan with earlier scans if the
     noise is 1e-4 or more; with ``off``, every scan is solved on its own."""

@@ -30,6 +30,7 @@ def is_collected(item: object) -> bool:
     return any(each is item for each in gc.get_objects())
 
 
+@pytest.mark.long
 def test_collections_pass_over_what_was_there_and_still_find_what_is_new() -> None:
     old = Link()
     with without_long_collections():
@@ -43,6 +44,7 @@ def test_collections_pass_over_what_was_there_and_still_find_what_is_new() -> No
     assert is_collected(old)
 
 
+@pytest.mark.long
 def test_the_end_of_an_inner_block_does_not_end_the_outer_one() -> None:
     """As where a host and simulated nodes run in one program."""
     old = Link()

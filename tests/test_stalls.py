@@ -75,6 +75,7 @@ def test_it_runs_again_with_new_fixtures(tmp_path: Path, workers: int, fails_in_
     assert "and run again" in output
 
 
+@pytest.mark.long
 def test_where_stalls_count_it_fails(tmp_path: Path) -> None:
     status, output = run(tmp_path, "-n", "0", "--stalls-count")
     assert status == 1

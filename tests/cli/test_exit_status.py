@@ -329,6 +329,7 @@ main()
 """
 
 
+@pytest.mark.long
 def test_one_while_python_frees_its_modules_does_not_matter() -> None:
     done = subprocess.run(
         [sys.executable, "-c", LATE.format(numbers=[int(number) for number in SIGNALS])],

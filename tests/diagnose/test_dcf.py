@@ -198,6 +198,7 @@ def test_a_node_is_as_its_dcf_says(
 ALIKE = [b"", b"abc", b"abc\0", b"abc ", b" abc", b"0", b"a\x1b", b"a\\x1b", b"x" * 300, b"x" * 299 + b"y"]
 
 
+@pytest.mark.long
 @pytest.mark.system_time  # threads of the canopen library
 @pytest.mark.parametrize("data_type", sorted(STRINGS))
 def test_strings_that_look_alike_differ_visibly(

@@ -283,6 +283,7 @@ def test_a_second_node_with_the_same_id_comes_and_goes(running: Running) -> None
     running.assert_back()
 
 
+@pytest.mark.long
 def test_a_lost_answer_to_a_tare_is_no_operational_patch(running: Running) -> None:
     """Its scans are withheld, since nobody knows the baseline they are encoded with."""
     running.fleet.inject(Faults(sdo_response_lost=1.0), "p0")

@@ -110,6 +110,7 @@ def test_node_reset_in_the_middle_of_a_scan(running: Hand) -> None:
     assert eventually(lambda: running.host.health("p0").rejoins == resets == 1)
 
 
+@pytest.mark.long
 def test_node_that_restarts_in_a_loop_is_told_as_such(running: Hand) -> None:
     boot_ups = running.host.health("p0").boot_ups
     running.inject(Faults(restart_every_s=0.3))

@@ -217,6 +217,7 @@ def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfi
         assert f"fault: {patch}: lost at the end" in done.stdout.splitlines()
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_summaries_that_are_lost_are_said_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

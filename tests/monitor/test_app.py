@@ -149,6 +149,7 @@ def test_a_guest_says_that_it_does_not_tare() -> None:
         in_app(source, play)
 
 
+@pytest.mark.long
 def test_what_the_record_key_wrote_replays(tmp_path: Path) -> None:
     hand = a_hand()
     with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:

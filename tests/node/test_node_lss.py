@@ -164,6 +164,7 @@ class TestOnADesk:
             assert desk.frame(0x7E5, "04 01 00 00 00 00 00 00"[: 3 * length]) == []
         assert desk.frame(0x7E5, "5e 00 00 00 00 00 00 00") == []  # still waiting
 
+    @pytest.mark.long
     def test_whatever_comes(self, blank) -> None:
         """Requests right and wrong, resets and power cycles in any order: the node-ID is always one that was
         asked for, and boot-up messages name it."""

@@ -188,6 +188,7 @@ def download(bench: Bench, value: bytes, announce: bool, fate: Iterator[int], sp
     raise AssertionError("no end")
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=200)
 @given(values, st.booleans(), fates)
 def test_download_arrives_whole_or_is_aborted(value: bytes, announce: bool, fate: list[int]) -> None:

@@ -44,6 +44,7 @@ SIZES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compiler", ACCEPTED)
 @pytest.mark.parametrize("profile", some_long(SIZES, SIZES[0]), ids=eds_name)
 def test_no_warning(profile: PatchProfile, compiler: str, tmp_path: Path) -> None:

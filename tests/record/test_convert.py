@@ -71,6 +71,7 @@ def test_a_log_without_frames_is_no_damaged_one(tmp_path: Path, suffix: str) -> 
     assert reader.damages == []
 
 
+@pytest.mark.long
 def test_a_log_next_to_its_source_shares_the_journal(recorded: Path, tmp_path: Path) -> None:
     source = tmp_path / "run.log"
     for suffix in (".log", ".jsonl"):
@@ -123,6 +124,7 @@ def test_frames_of_every_kind_survive_each_format(tmp_path: Path) -> None:
             assert found == wanted
 
 
+@pytest.mark.long
 def test_an_mcap_file_gets_the_fields_that_a_replay_computes(recorded: Path, tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
@@ -171,6 +173,7 @@ def test_a_table_holds_the_fields_and_the_resistances(recorded: Path, tmp_path: 
     assert explained > 20
 
 
+@pytest.mark.long
 def test_npz_and_parquet_hold_the_same(recorded: Path, tmp_path: Path) -> None:
     convert(recorded, tmp_path / "x.parquet")
     convert(recorded, tmp_path / "x.npz")

@@ -187,6 +187,7 @@ def test_a_node_that_restarts_is_decoded_again(recorded: Path, tmp_path: Path) -
     assert run.flaws == []
 
 
+@pytest.mark.long
 def test_a_new_baseline_is_not_guessed(tmp_path: Path) -> None:
     """p0 is tared; a log does not contain its new baseline. p1 goes on."""
     hand, path = a_hand(), tmp_path / "run.log"
@@ -212,6 +213,7 @@ def test_a_new_baseline_is_not_guessed(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.long
 def test_the_command_reads_and_converts_it(recorded: Path, tmp_path: Path) -> None:
     hand_file(tmp_path)
     log, hand, target = foreign(recorded, tmp_path), str(tmp_path / "hand.toml"), tmp_path / "x.mcap"

@@ -502,6 +502,7 @@ def test_readers_that_need_the_index_refuse_a_killed_file_and_take_the_repaired_
         assert bag.message_count == len(numbers_in(path)[0]) + 2
 
 
+@pytest.mark.long
 def test_a_repaired_recording_is_whole_and_says_that_it_was_repaired(tmp_path: Path, run: Any) -> None:
     """Its replay has no fault, and the fields of the readable part of the original."""
     whole, cut, good, again = (tmp_path / f"{name}.mcap" for name in ("whole", "cut", "good", "again"))
@@ -522,6 +523,7 @@ def test_a_repaired_recording_is_whole_and_says_that_it_was_repaired(tmp_path: P
         assert [note for note in played.notes if "was repaired" in note]
 
 
+@pytest.mark.long
 def test_a_changed_byte_in_an_index_hides_no_line_of_the_journal(tmp_path: Path) -> None:
     """Message indexes have no checksum; an index that is not believed costs time, not events."""
     path, hand = tmp_path / "x.mcap", a_hand()
@@ -549,6 +551,7 @@ def test_a_changed_byte_in_an_index_hides_no_line_of_the_journal(tmp_path: Path)
     assert changed > 100
 
 
+@pytest.mark.long
 def test_a_copy_with_frames_only_has_no_messages_of_another_kind(tmp_path: Path, run: Any) -> None:
     path, small = run[0], tmp_path / "small.mcap"
     done = CliRunner().invoke(app, ["convert", str(path), str(small), "--frames-only", "--json"])

@@ -364,6 +364,7 @@ def test_what_has_no_name_is_no_recording(name: str) -> None:
         replay(name)
 
 
+@pytest.mark.long
 def test_two_logs_of_one_name_in_a_folder_have_a_journal_each(tmp_path: Path) -> None:
     hand = hand_on(BusConfig(interface="timed", channel="two-logs"))
     live: dict[str, set[tuple[str, int]]] = {}
@@ -385,6 +386,7 @@ def test_two_logs_of_one_name_in_a_folder_have_a_journal_each(tmp_path: Path) ->
         assert run.flaws == []  # such as a journal of another number of frames
 
 
+@pytest.mark.long
 def test_scans_that_were_skipped_are_noted_as_a_replay_counts_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

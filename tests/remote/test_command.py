@@ -75,6 +75,7 @@ def test_a_program_uses_the_hand_of_the_command(
     assert ended.value.code in (0, 1)  # 1 if this computer was too slow for the simulated nodes
 
 
+@pytest.mark.long
 def test_a_second_daemon_is_refused_before_it_opens_a_bus(
     start: Callable[..., Process], hand_file: Path, port: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

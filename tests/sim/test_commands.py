@@ -169,6 +169,7 @@ BAD_TEXTS = {
 }
 
 
+@pytest.mark.long
 def test_a_bad_text_is_one_line_and_status_2(
     hand: Path, start: Callable[..., Simulator], vcan_sim: Callable[..., Ended]
 ) -> None:

@@ -368,6 +368,7 @@ def test_the_schedule_of_a_fleet_that_is_started_again_goes_on(virtual: VirtualC
     ]
 
 
+@pytest.mark.long
 def test_a_fleet_is_started_again_before_its_scene_begins(virtual: VirtualClock) -> None:
     fleet = Fleet(HAND, scene=scene({"where": "palm", "fault": "frozen"}))
     for _ in range(2):

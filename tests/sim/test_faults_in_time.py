@@ -158,6 +158,7 @@ def test_a_healthy_stream_is_whole() -> None:
     stream.assert_none_is_mixed()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", some_long(range(4), 0))
 def test_all_faults_at_once_are_counted_to_the_frame(seed: int) -> None:
     stream = Stream()

@@ -132,6 +132,7 @@ def test_a_rogue_master(running: Running) -> None:
     running.comes_back()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", some_long([0.02, 0.3], 0.02))
 def test_a_disturbed_bus(running: Running, share: float) -> None:
     running.suffer(3.0, disturbed=share)
@@ -163,6 +164,7 @@ def test_two_runs_are_identical() -> None:
     assert run() == first
 
 
+@pytest.mark.long
 def test_a_scene_attacks_a_bus() -> None:
     plan = parse_scene(
         {"faults": [{"where": "can0", "fault": "rogue_sync_per_s=100.0", "from_s": 0.5, "to_s": 1.0}]}

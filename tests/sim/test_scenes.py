@@ -193,6 +193,7 @@ def test_a_touch_by_force_reaches_the_force(slide: PatchScene) -> None:
         assert -slide.truth(t).contacts[0].force_n[2] == pytest.approx(2.0, rel=0.005)
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(
     gap=st.floats(0.0, 5e-6),

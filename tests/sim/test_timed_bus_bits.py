@@ -33,6 +33,7 @@ def random_frame(rng: random.Random, fd: bool, extended: bool, remote: bool) -> 
     return CanFrame(can_id, data, extended, fd=fd, brs=fd and rng.random() < 0.7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fd", "extended", "remote"),
     some_long(

@@ -560,6 +560,7 @@ RULES = st.lists(
 )
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(RULES, st.integers(0, 2**32))
 def test_counters_are_those_that_the_rules_give(rules: list[Disturbance], seed: int) -> None:

@@ -182,6 +182,7 @@ def test_a_small_body_on_a_thin_layer_is_found(family, number, name):
     assert (field.displacement_m[deep, 2] < 0.25 * truth[deep, 2]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "height"),
     some_long([("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0)], ("staggered", 0.5)),

@@ -384,6 +384,7 @@ def test_noise_of_a_frame_that_is_none_drops_its_resistance(small):
     assert tracker.update(rest).trusted
 
 
+@pytest.mark.long
 def test_same_bits_whatever_else_runs(staggered, stream):
     """With every option on, four at a time, beside trackers of other options fed other frames."""
     rng = np.random.default_rng(13)

@@ -54,6 +54,7 @@ def test_shortened_step_is_the_damped_one_of_the_right_length(n, spare, decades,
     np.testing.assert_allclose(scale * w.step, truth, rtol=0, atol=10 * (n + m) * EPS * open_)
 
 
+@pytest.mark.long
 @settings(max_examples=200, deadline=None)
 @given(
     st.integers(1, 6),

@@ -153,6 +153,7 @@ the skin crosses a fold, and a start from the smoothest displacement finds a smo
 the last, the posterior moves two wires away from the ends of their paths, and only one path is smooth."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "schedule", some_long([sk.Uniform(), sk.Periodic(cycle=1), sk.Adaptive()], sk.Adaptive())
 )

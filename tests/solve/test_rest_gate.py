@@ -22,6 +22,7 @@ def tracker(noise: float, **options: object) -> sk.Tracker:
     return sk.Tracker(LAYOUT, relative_noise=noise, baseline_ohm=REST, **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("noise", "method"),
     some_long(

@@ -190,6 +190,7 @@ def sampled(start_m: np.ndarray, speed_m_s: np.ndarray, t_s: float, row_s: float
     return start_m + speed_m_s * (t_s + row_s * WIRES[:, None, None])
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(
     st.integers(0, 2**32 - 1),

@@ -66,6 +66,7 @@ def changes(touched: list[bool | None]) -> list[bool | None]:
     return [now for now, before in zip(touched, [None, *touched[:-1]], strict=True) if now is not before]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("drift", some_long(["steady", "walk"], "walk"))
 def test_presses_are_found_and_released_once(drift: str) -> None:
     """Spheres of 2 % and dents of 5 % of the layer height, within three frames; one onset, one release."""

@@ -129,6 +129,7 @@ def test_the_state_is_drawn_several_times_a_second_even_without_fields() -> None
     assert {patch.condition for patch in views[-1].patches} == {"lost"}
 
 
+@pytest.mark.long
 def test_events_are_drawn_once() -> None:
     ticks: list[Tick] = []
     with drawn(ticks.append) as (host, fleet, _thread, _):

@@ -3,21 +3,25 @@
     python docs/view_cost.py [SECONDS [TOUCHED]]
 
 As in `skinnode bench pipeline`, a child process replays the frames of a hand over UDP. The first TOUCHED
-patches are pressed and stroked: 4 by default. The script alternates between runs without a view and runs with
-a view that writes to the browser's data server. The host runs on one core; the generator, the drawing and the
-data server run on another. If permitted, the generator has real-time priority, because frames that it sends
-late would look like a slow host.
+patches are pressed and stroked: 4 by default. The script alternates between runs without a view, runs with a
+view that writes to the browser's data server, and runs beside an unrelated program. The unrelated program
+takes as much CPU time on the other core as the drawing and the data server, so a difference between the last
+two kinds of run is due to the view rather than to a computer whose cores slow each other down. The host runs
+on one core; the generator, the drawing and the data server run on another. If permitted, the generator has
+real-time priority, because frames that it sends late would look like a slow host.
 """
 
 from __future__ import annotations
 
 import os
 import statistics
+import subprocess
 import sys
 import tempfile
 import threading
 import time
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +40,20 @@ from skinnode.view.viewer_process import free_port
 
 ROUNDS: Final = 5
 PERIOD_MS: Final = 33
+KINDS: Final = ("without view", "with view", "beside another program")
+_OTHER: Final = """
+import os, sys, time
+import numpy as np
+
+os.nice(10)
+data = np.zeros(4000)
+while True:
+    end = time.process_time() + float(sys.argv[1]) * 0.033
+    while time.process_time() < end:
+        str(np.sin(data).tolist())
+    time.sleep(0.033 * (1.0 - float(sys.argv[1])))
+"""
+"""Program that occupies the given share of a core, in a burst for each drawn frame."""
 
 
 def cpu_s(name: str) -> float:
@@ -45,7 +63,33 @@ def cpu_s(name: str) -> float:
     return sum(int(text.split()[0]) * 1e-9 for text in texts)
 
 
-def measure(hand: Any, generator: Generator, core: int, seconds: float, *, viewed: bool) -> dict[str, float]:
+def children_cpu_s(process: int | str = "self") -> float:
+    """Return the CPU time (s) of the running child processes and of their child processes."""
+    total = 0.0
+    with suppress(FileNotFoundError):
+        for task in Path(f"/proc/{process}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                values = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+                total += (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
+                total += children_cpu_s(child)
+    return total
+
+
+@contextmanager
+def other_program(share: float, core: int) -> Iterator[None]:
+    """Run a program that occupies the given share of the core."""
+    with subprocess.Popen([sys.executable, "-c", _OTHER, str(share)]) as program:
+        os.sched_setaffinity(program.pid, {core})
+        time.sleep(1.0)
+        try:
+            yield
+        finally:
+            program.kill()
+
+
+def measure(
+    hand: Any, generator: Generator, core: int, seconds: float, *, viewed: bool, other: float
+) -> dict[str, float]:
     generator.send_heartbeats([bus.name for bus in hand.buses])
     own = os.sched_getaffinity(0)
     with ExitStack() as stack:
@@ -56,6 +100,8 @@ def measure(hand: Any, generator: Generator, core: int, seconds: float, *, viewe
             how = DrawingOptions(10.0, time.time_ns() - time.monotonic_ns(), live=True)
             process = stack.enter_context(DrawingProcess(hand, output.target("cost"), how))
             os.sched_setaffinity(0, own)
+        if other:
+            stack.enter_context(other_program(other, core))
         stack.enter_context(responsive_threads())
         host = stack.enter_context(Host.from_config(hand, open_port=DatagramPort))
         reader = stack.enter_context(FieldReader(host.fields()))
@@ -66,8 +112,10 @@ def measure(hand: Any, generator: Generator, core: int, seconds: float, *, viewe
         begin_ns = generator.begin()
         time.sleep(LEAD_S / 2)
         begun_s, process_s, drawing_s = time.monotonic(), time.process_time(), cpu_s("draw")
+        children_s = children_cpu_s()
         generator.wait()
         wall_s = time.monotonic() - begun_s
+        children_s = children_cpu_s() - children_s
         process_s, drawing_s = time.process_time() - process_s, cpu_s("draw") - drawing_s
         settle(host)
         streams = list(host.stats().patches.values())
@@ -81,6 +129,7 @@ def measure(hand: Any, generator: Generator, core: int, seconds: float, *, viewe
         "p99": float(np.percentile(published_ms, 99)),
         "process": process_s / wall_s,
         "thread": drawing_s / wall_s,
+        "children": children_s / wall_s,
         "drawn_hz": 0.0 if counts is None else counts.drawn / seconds / len(streams),
         "dropped": 0 if counts is None else counts.dropped,
     }
@@ -91,7 +140,7 @@ def main() -> None:
     touched = int(sys.argv[2]) if len(sys.argv) > 2 else 4
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[:1])
-    rows: dict[bool, list[dict[str, float]]] = {False: [], True: []}
+    rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
     print(f"load average {os.getloadavg()[0]:.1f}")
     with tempfile.TemporaryDirectory() as folder:
         hand = full_hand(4, True, 3.0, "udp", "", Path(folder), one_worker=True)
@@ -103,15 +152,23 @@ def main() -> None:
             without_long_collections(),
         ):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-            for number in range(2 * ROUNDS):
-                viewed = bool(number % 2)
-                row = measure(hand, generator, cores[-1], seconds, viewed=viewed)
-                rows[viewed].append(row)
-                values = "  ".join(f"{name} {value:.4g}" for name, value in row.items())
-                print(f"{'with' if viewed else 'without'} view: {values}", flush=True)
-    for name in ("skipped", "p50", "p99", "process", "thread", "drawn_hz"):
-        without, with_ = (statistics.median(row[name] for row in rows[viewed]) for viewed in (False, True))
-        print(f"median {name}: {without:.4g} without, {with_:.4g} with")
+            for number in range(ROUNDS):
+                for kind in KINDS if number % 2 == 0 else (*KINDS[1::-1], KINDS[2]):
+                    other = share(rows) if kind == KINDS[2] else 0.0
+                    row = measure(hand, generator, cores[-1], seconds, viewed=kind == KINDS[1], other=other)
+                    rows[kind].append(row)
+                    values = "  ".join(f"{name} {value:.4g}" for name, value in row.items())
+                    print(f"{kind}: {values}", flush=True)
+    for name in ("skipped", "p50", "p99", "process", "thread", "children", "drawn_hz"):
+        medians = (statistics.median(row[name] for row in rows[kind]) for kind in KINDS)
+        texts = [f"{value:.4g} {kind}" for value, kind in zip(medians, KINDS, strict=True)]
+        print(f"median {name}:", ", ".join(texts))
+
+
+def share(rows: dict[str, list[dict[str, float]]]) -> float:
+    """Return the median share of a core that the drawing and the data server took so far."""
+    without, with_ = (statistics.median(row["children"] for row in rows[kind]) for kind in KINDS[:2])
+    return max(0.01, with_ - without)
 
 
 if __name__ == "__main__":

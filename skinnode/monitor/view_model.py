@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import statistics
 from collections import deque
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from skinnode.host.patch_stream import StreamStats
 from skinnode.host.trust_report import deepest_data_share
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.distrust_text import why_not
+from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.monitor.field_map import Surface, mean_shear_m, surface_of
 from skinnode.monitor.source import Arrivals, Snapshot
@@ -125,10 +127,10 @@ class LogLine:
 
 
 class History:
-    """Snapshots of the last few seconds, from which views are computed."""
+    """Snapshots of the last few seconds, from which views are computed; see :func:`view_of`."""
 
-    def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
-        self._hand, self._live = hand, live
+    def __init__(self, hand: HandConfig, *, live: bool = True, maps: bool = True) -> None:
+        self._hand, self._live, self._maps = hand, live, maps
         self._kept: deque[Snapshot] = deque()
 
     def add(self, snapshot: Snapshot) -> View:
@@ -141,20 +143,21 @@ class History:
         kept.append(snapshot)
         while len(kept) > 2 and kept[1].t_ns < snapshot.t_ns - HISTORY_NS:
             kept.popleft()
-        return view_of(self._hand, kept, live=self._live)
+        return view_of(self._hand, kept, live=self._live, maps=self._maps)
 
 
-def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True) -> View:
+def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True, maps: bool = True) -> View:
     """Return the view of the newest snapshot.
 
     Args:
         hand: The hand.
         history: Snapshots, oldest first; rates are averages over the whole history.
         live: Whether the source is a running host; a recording has no latencies.
+        maps: Whether to compute what only the monitor shows: the surface, shear and touches of each patch.
     """
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
-    patches = tuple(_patch_view(patch, history, elapsed_s, live) for patch in hand.patches)
+    patches = tuple(_patch_view(patch, history, elapsed_s, live, maps) for patch in hand.patches)
     buses = tuple(_bus_view(bus, now, before, elapsed_s) for bus in hand.buses if bus.name in now.bus_health)
     slowest = [patch.latency_max_s for patch in patches if patch.latency_max_s is not None]
     medians = [patch.latency_s for patch in patches if patch.latency_s is not None]
@@ -170,20 +173,19 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
     )
 
 
-def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float, live: bool) -> PatchView:
+def _patch_view(
+    patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float, live: bool, maps: bool
+) -> PatchView:
     now, before, name = history[-1], history[0], patch.name
     health, field, arrivals = now.health[name], now.fields[name], now.arrivals[name]
     condition, level, words = judge_patch(health, _recent_losses(name, now, before))
     if now.away is not None:
         words = ("daemon away",)  # the other faults are out of date
     rest_m = now.supplied_m[name] if name in now.supplied_m else upper_m(patch.layout)
-    surface = None if field is None else surface_of(field, rest_m)
-    depth_m = depth_std_m = None
-    if field is not None and surface is not None:
-        known = np.where(surface.unknown, -np.inf, surface.depth_m)
-        depth_m = max(0.0, surface.deepest_m)
-        std_m = float(field.displacement_std_m[..., 2].flat[int(known.argmax())])
-        depth_std_m = std_m if np.isfinite(std_m) else None
+    depth_m = depth_std_m = surface = None
+    if field is not None:
+        depth_m, depth_std_m = _deepest_m(field)
+        surface = surface_of(field, rest_m) if maps else None
     latencies = _latencies_s(history, name) if live else []
     return PatchView(
         name=name,
@@ -209,8 +211,17 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
         depth_m=depth_m,
         depth_std_m=depth_std_m,
         shear_m=(0.0, 0.0) if surface is None else mean_shear_m(surface),
-        touches=() if field is None else touches_of(field, rest_m),
+        touches=() if field is None or not maps else touches_of(field, rest_m),
     )
+
+
+def _deepest_m(field: FieldFrame) -> tuple[float, float | None]:
+    """Return the depth of the most deeply pressed electrode and its standard deviation, in m."""
+    std_m = field.displacement_std_m[..., 2]
+    known_m = np.where(np.isfinite(std_m), -field.displacement_m[..., 2], -np.inf)
+    place = int(known_m.argmax())
+    deviation_m = float(std_m.flat[place])
+    return max(0.0, float(known_m.flat[place])), deviation_m if math.isfinite(deviation_m) else None
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:

@@ -6,7 +6,9 @@ and drop counter. UDP over the loopback device stands in for the kernel's CAN dr
 
 from __future__ import annotations
 
+import random
 import socket
+from contextlib import suppress
 from typing import Any, Final
 
 import can
@@ -17,6 +19,8 @@ from skinnode.transport.socket_options import enlarge_receive_buffer
 from skinnode.transport.socketcan import HEADER, SocketReader
 
 LOOPBACK: Final = "127.0.0.1"
+_CHANNELS: Final = range(20_000, 32_768)
+"""Ports below those that Linux and other systems assign automatically."""
 _MTU: Final = {False: 8, True: 64}  # data bytes in struct can_frame and struct canfd_frame from <linux/can.h>
 
 
@@ -32,10 +36,16 @@ def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
 
 
 def free_channel() -> str:
-    """Return the number of a free UDP port on this machine."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((LOOPBACK, 0))
-        return str(sock.getsockname()[1])
+    """Return the number of a free UDP port on this machine.
+
+    The system does not assign this port to other programs' sockets before the bus is opened.
+    """
+    rng = random.SystemRandom()
+    while True:
+        port = rng.choice(_CHANNELS)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, suppress(OSError):
+            sock.bind((LOOPBACK, port))
+            return str(port)
 
 
 class DatagramPort(CanPort):

@@ -53,7 +53,7 @@ class Conversion:
         self.replay: Replay = replay(path, cancelled=self._before_frame, hand=hand)
         """The replay; its ``hand`` is the recorded hand."""
         self.faults = FaultBook(live=False)
-        self._history = History(self.replay.hand, live=False)
+        self._history = History(self.replay.hand, live=False, maps=False)
         self._positions = SuppliedPositions(self.replay.hand, self.replay.layout)
         events = Events()
         self._events = events.subscribe(_EVENTS)
@@ -107,6 +107,8 @@ class Conversion:
             self._watch.check()
             if not self._state_ns <= now_ns < self._state_ns + STATE_S * 1e9 and now_ns:
                 self._flush(ending=False, state=True)
+            elif self._is_due():
+                self._flush(ending=False)
         return False
 
     def _flush(self, *, ending: bool, state: bool = False) -> None:

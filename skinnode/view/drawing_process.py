@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -79,10 +80,9 @@ class DrawingProcess(Closing):
         Raises:
             SkinError: The child process has ended.
         """
-        try:
-            self._connection.send(
-                replace(tick, fields={name: _slim(each) for name, each in tick.fields.items()})
-            )
+        slim = replace(tick, fields={name: _slim(each) for name, each in tick.fields.items()})
+        try:  # Connection.send() pickles with an older protocol, which copies the arrays once more
+            self._connection.send_bytes(pickle.dumps(slim, pickle.HIGHEST_PROTOCOL))
         except OSError:
             raise SkinError(f"drawing: {self._complaint()}") from None
 

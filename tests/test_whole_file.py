@@ -48,6 +48,7 @@ def test_a_disk_that_fills_up_leaves_what_was_there(tmp_path: Path, before: str 
     )
 
 
+@pytest.mark.long
 def test_an_output_may_be_a_link_or_no_file_at_all(tmp_path: Path) -> None:
     """The user has named it: unlike the memory of a node it is followed."""
     target, link = tmp_path / "patch.eds", tmp_path / "link.eds"

@@ -276,6 +276,7 @@ def test_a_wrong_case_is_named_and_ends_with_status_1(monkeypatch, tmp_path) -> 
     assert "off by 0.0001 by exact: 60 of 60 wires wrong" in result.output
 
 
+@pytest.mark.long
 def test_honest_cases_end_with_status_0_and_every_figure(monkeypatch, tmp_path) -> None:
     picture = tmp_path / "picture.png"
     result, figures = stability(monkeypatch, tmp_path, [small_case(0.0)], "--plot", str(picture))

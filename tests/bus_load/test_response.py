@@ -101,6 +101,7 @@ ALMOST_FULL = [
 ]
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=200)
 @example(ALMOST_FULL, 3)
 @given(messages_on_a_bus(jitter=0), st.integers(0, 4))
@@ -145,6 +146,7 @@ def test_nothing_is_worse(examples: int) -> None:
     settings(deadline=None, max_examples=examples)(check)()
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(messages_on_a_bus(jitter=0), st.data())
 def test_most_in_a_window_is_counted(messages: list[Message], data: st.DataObject) -> None:

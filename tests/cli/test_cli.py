@@ -177,6 +177,7 @@ def test_a_group_without_a_command_shows_its_help() -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 def test_completion_is_written_for_the_shell() -> None:
     """What ``skinnode --install-completion`` installs; ``--show-completion`` prints it by itself."""
     script = completion(_SKINNODE_COMPLETE="source_bash")

@@ -384,6 +384,7 @@ def test_who_reads_may_go_from_any_command(
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("program", PROGRAMS.values())
 def test_a_command_starts_no_threads_for_linear_algebra(program: str) -> None:
     """They wait by spinning: on every processor, under a real-time policy, they stopped a host for good."""

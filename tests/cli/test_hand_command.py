@@ -65,6 +65,7 @@ def test_tables_for_a_person() -> None:
     assert any(line.split()[:4] == ["palm", "14", "100", "59.4"] for line in lines)
 
 
+@pytest.mark.long
 def test_how_long_frames_of_others_wait(tmp_path: Path) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(
@@ -88,6 +89,7 @@ def overloaded(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_too_much_for_a_bus_is_shown_and_refused(tmp_path: Path) -> None:
     path = overloaded(tmp_path)
     found = command("check", str(path))
@@ -102,6 +104,7 @@ def test_too_much_for_a_bus_is_shown_and_refused(tmp_path: Path) -> None:
     assert json.loads(as_json.stdout)["buses"][0]["shortest_period_ms"] == 100
 
 
+@pytest.mark.long
 def test_a_scan_that_may_outlast_its_period_is_noted(tmp_path: Path) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(
@@ -244,6 +247,7 @@ def test_a_hand_whose_displacements_come_from_the_prior_says_so(tmp_path: Path) 
     assert not said(notes(tmp_path, PALM), "patches.layout")
 
 
+@pytest.mark.long
 def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
     thick = 'layout = { preset = "aligned", height_m = 4e-3 }\n'
     solver = '[solver]\nmethod = "exact"\n'
@@ -272,6 +276,7 @@ def test_discs_are_recommended_where_they_help(tmp_path: Path) -> None:
     assert not said(notes(tmp_path, '[solver]\nprior = "discs"\n' + PALM + noisy), "solver.prior")
 
 
+@pytest.mark.long
 def test_how_many_scans_can_be_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "hand.toml"
     path.write_text('[[buses]]\nname = "can0"\n[sync]\nperiod_ms = 400\n[solver]\nworkers = 2\n' + PALM + TIP)
@@ -299,6 +304,7 @@ def test_a_computer_that_is_too_slow_for_the_planned_rate(tmp_path: Path) -> Non
     assert SolveRate(4, {"palm": 0.5, "tip": 0.1}).rate_hz == 2.0  # a patch has at most one thread
 
 
+@pytest.mark.long
 def test_forces_that_are_not_calibrated(tmp_path: Path) -> None:
     calibrated = "calibration = { young_pa = 0.8e6, force_calibrated = true }\n"
     listed = notes(tmp_path, PALM + calibrated + TIP)
@@ -327,6 +333,7 @@ def test_what_the_solver_leaves_out_or_cannot_reach(tmp_path: Path) -> None:
     assert not said(roomy, "solver.normal_only")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("deadline_us", "met"), [(100, False), (10_000_000, True)])
 def test_a_deadline_that_a_new_touch_cannot_meet(tmp_path: Path, deadline_us: int, met: bool) -> None:
     sk.Posterior(sk.PatchLayout.preset("staggered"))  # the deadline is checked with compiled kernels only

@@ -75,6 +75,7 @@ def test_a_healthy_hand(hand_file: HandFile, on: On) -> None:
     assert examine(file, "--active") == (0, {})
 
 
+@pytest.mark.long
 def test_a_running_hand_is_judged_and_not_disturbed(hand_file: HandFile, on: On) -> None:
     file = hand_file()
     with file.open("a") as text:  # a machine that stands still for half a second loses no node
@@ -98,6 +99,7 @@ def test_a_running_hand_is_judged_and_not_disturbed(hand_file: HandFile, on: On)
     assert {host.health(patch.name).rejoins for patch in hand.patches} == {0}
 
 
+@pytest.mark.long
 def test_scans_of_a_hand_with_a_long_sync_period_are_judged(
     hand_file: HandFile, on: On, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +179,7 @@ def test_a_second_master(hand_file: HandFile, on: On) -> None:
     assert "can0: another device sends NMT commands" in found
 
 
+@pytest.mark.long
 def test_another_layout_serial_and_eds(hand_file: HandFile, on: On, tmp_path: Path) -> None:
     right = hand_file()
     text = right.read_text()
@@ -219,6 +222,7 @@ def test_an_interface_that_does_not_open(hand_file: HandFile) -> None:
     assert found.keys() == {"can0: the interface does not work"}
 
 
+@pytest.mark.long
 def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
     file = hand_file()
     hand = load_hand(file)
@@ -233,6 +237,7 @@ def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
     assert "160 ms; the period is 25 ms" in found["thumb: a scan takes longer than a SYNC period"][1]
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_a_node_that_no_host_has_configured_is_no_fault(hand_file: HandFile, on: On) -> None:
     """Its default inhibit time suits the default period; bring-up writes one that suits the hand's period."""
@@ -291,6 +296,7 @@ def test_the_report_needs_nothing_else(
     assert "index: noise on lower wire 4" in report.read_text()
 
 
+@pytest.mark.long
 def test_load_is_that_of_the_time_in_which_scans_came(
     hand_file: HandFile, on: On, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,6 +112,7 @@ def test_dumps_every_value(any_bus: BusConfig, powered: Powered) -> None:
     assert len(bytes.fromhex(told[0x2301, 0]["hex"])) == 4 * 12
 
 
+@pytest.mark.long
 def test_dcf_is_one_to_another_parser_and_to_ourselves(
     bus: BusConfig, powered: Powered, tmp_path: Path
 ) -> None:

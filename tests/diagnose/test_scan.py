@@ -67,6 +67,7 @@ def test_a_slow_bus_can_carry_the_requests(bus: BusConfig, connection_on: Connec
     assert times_ns[126] - times_ns[0] > 126 * 2 * 2_160_000  # each request, and a response to each
 
 
+@pytest.mark.long
 def test_nodes_without_a_node_id_are_told_apart_and_wait_again(
     bus: BusConfig, powered: Powered, connection_on: ConnectionOn
 ) -> None:

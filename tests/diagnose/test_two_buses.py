@@ -69,6 +69,7 @@ def test_a_patch_named_like_a_number_is_not_mistaken_for_a_node(two_buses: Path)
     assert run(["info", "5", "--hand", two_buses, "--bus", "right", "--json"]).json["serial"] == 65
 
 
+@pytest.mark.long
 def test_a_node_id_of_no_patch_needs_a_bus(two_buses: Path) -> None:
     done = run(["info", "9", "--hand", two_buses])
     assert done.status == 2
@@ -105,6 +106,7 @@ def test_scan_and_nmt_all_take_every_bus(two_buses: Path) -> None:
     assert "without a node-ID" in run(["lss", "list", "--hand", two_buses]).stdout
 
 
+@pytest.mark.long
 def test_lss_set_finds_the_bus_by_serial_number_or_node_id(two_buses: Path) -> None:
     done = run(["lss", "set", "--serial", 65, "--node-id", 7, "--yes", "--no-store", "--hand", two_buses])
     assert done.status == 0, done.stderr

@@ -175,6 +175,7 @@ def test_a_host_that_was_killed_is_followed_by_another(
         assert all(patch.assembler.scans_torn == 0 for patch in host.stats().patches.values())
 
 
+@pytest.mark.long
 def test_no_node_at_all(hand: HandConfig) -> None:
     start_s = clock.monotonic()
     with pytest.raises(BusError) as caught, Host.from_config(hand, boot_deadline_s=0.5):

@@ -108,6 +108,7 @@ def test_lost_chunks(running: Hand) -> None:
     assert counted.scans_missed == skipped
 
 
+@pytest.mark.long
 def test_duplicated_chunks(running: Hand) -> None:
     injected = running.suffer(Faults(duplicated=0.05))
     counted = running.stream().assembler
@@ -116,6 +117,7 @@ def test_duplicated_chunks(running: Hand) -> None:
     assert counted.scans_torn == counted.chunks_lost == counted.conflicts == 0
 
 
+@pytest.mark.long
 def test_reordered_chunks(running: Hand) -> None:
     injected = running.suffer(Faults(reordered=0.1))
     counted = running.stream().assembler
@@ -131,6 +133,7 @@ def test_late_chunks(running: Hand) -> None:
     assert counted.scans_torn == injected.scans_spoilt
 
 
+@pytest.mark.long
 def test_short_and_remote_frames(running: Hand) -> None:
     injected = running.suffer(Faults(short=0.03, remote=0.03))
     counted, bus = running.stream().assembler, running.host.stats().buses["can0"]
@@ -152,6 +155,7 @@ def test_heartbeats_that_are_too_long(running: Hand) -> None:
     assert [error.cob_id for error in running.host.stats().malformed] == [0x705]
 
 
+@pytest.mark.long
 def test_counters_of_scans_long_past_or_impossible(running: Hand) -> None:
     injected = running.suffer(Faults(miscounted=0.03, miscounted_by=-10))
     counted = running.stream().assembler
@@ -194,6 +198,7 @@ def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
     assert counted.scans_torn == counted.chunks_lost == counted.late == 0
 
 
+@pytest.mark.long
 def test_lost_summaries(running: Hand) -> None:
     injected = running.suffer(Faults(summary_lost=0.4))
     counted = running.stream().assembler
@@ -203,6 +208,7 @@ def test_lost_summaries(running: Hand) -> None:
     assert counted.scans_torn == counted.chunks_lost == 0
 
 
+@pytest.mark.long
 def test_lost_syncs(running: Hand) -> None:
     injected = running.suffer(Faults(sync_lost=0.4))
     counted, skipped = running.skipped()
@@ -245,6 +251,7 @@ def test_codes_changed_after_they_were_packed(running: Hand) -> None:
     assert losses_of_stream(running.stream())["scans_corrupt"].endswith("discarded by the check")
 
 
+@pytest.mark.long
 def test_chunks_with_the_counter_of_the_next_scan_that_loses_its_own(running: Hand) -> None:
     injected = running.suffer(Faults(displaced=0.4))
     counted = running.stream().assembler
@@ -253,6 +260,7 @@ def test_chunks_with_the_counter_of_the_next_scan_that_loses_its_own(running: Ha
     assert counted.scans_mixed == counted.conflicts == 0
 
 
+@pytest.mark.long
 def test_summaries_that_claim_that_the_rest_is_unchanged(running: Hand) -> None:
     injected = running.suffer(Faults(understated=0.4))
     counted = running.stream().assembler
@@ -273,6 +281,7 @@ def test_summaries_without_the_check_that_the_node_sends(running: Hand) -> None:
     assert counted.scans_torn == counted.chunks_lost == 0
 
 
+@pytest.mark.long
 def test_nodes_of_both_revisions_on_one_bus(
     make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +314,7 @@ def test_nodes_of_both_revisions_on_one_bus(
         assert tags.seen > 2 * SCANS
 
 
+@pytest.mark.long
 def test_threads_do_not_pile_up(running: Hand) -> None:
     before = threading.active_count()
     running.suffer(Faults(lost=0.2, sync_lost=0.2))

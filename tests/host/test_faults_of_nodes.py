@@ -78,6 +78,7 @@ def running(make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatc
         assert tags.mixed == []
 
 
+@pytest.mark.long
 def test_silent_node(running: Hand) -> None:
     boot_ups = running.host.health("p0").boot_ups
     running.inject(Faults(silent=True))

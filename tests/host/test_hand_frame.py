@@ -175,6 +175,7 @@ def test_a_patch_that_is_away_costs_no_more_time_after_three_frames() -> None:
     assert numbers(hand.next(0)) == {"a": 5, "b": 5}
 
 
+@pytest.mark.long
 @given(
     st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 12), st.integers(0, 40)), max_size=60),
 )
@@ -352,6 +353,7 @@ def test_one_after_the_other_as_async_for(hand: HandConfig, fleet: Fleet) -> Non
     assert [frame.scan - frames[0].scan for frame in frames] == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.long
 def test_a_patch_pulled_out_is_named_and_the_others_go_on(hand: HandConfig, rack: Rack) -> None:
     with Host.from_config(hand) as host:
         frames = host.hands(timeout_s=10, capacity=1000)

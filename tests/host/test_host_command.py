@@ -421,6 +421,7 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
         assert any(fault.startswith("thumb:") and "discarded by" in fault for fault in faults), faults
 
 
+@pytest.mark.long
 def test_the_emergency_of_a_faulty_patch_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, channel = tmp_path / "hand.toml", uuid.uuid4().hex
     path.write_text(TABLE.format(interface="virtual", channel=channel, layout=LAYOUT))

@@ -81,6 +81,7 @@ def test_a_search_that_the_bus_does_not_take_is_no_defect_of_the_host(
         assert host.stats().defects["p1"].count == 0
 
 
+@pytest.mark.long
 def test_a_node_that_does_not_answer_when_it_comes_back_is_not_refused(
     hand: HandConfig, rack_of: Callable[[HandConfig], Rack]
 ) -> None:

@@ -123,6 +123,7 @@ def all_operational(host: Host) -> bool:
     return {host.health(patch.name).condition for patch in host.hand.patches} == {Condition.OPERATIONAL}
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_a_guest_that_joins_while_patches_run_tears_no_scan(
     hand: HandConfig, rack: Rack, listener: CanPort, tmp_path: Path
@@ -165,6 +166,7 @@ def test_a_guest_that_hears_no_sync_says_so(hand: HandConfig, rack: Rack, listen
         assert eventually(lambda: host.bus_health("can0").no_sync)  # and again
 
 
+@pytest.mark.long
 def test_a_guest_that_may_configure_sends_sdo_and_nothing_else(
     hand: HandConfig, rack: Rack, listener: CanPort
 ) -> None:
@@ -224,6 +226,7 @@ def test_a_baseline_file_that_is_none(hand: HandConfig, tmp_path: Path, text: st
     assert str(caught.value) == f"{file}: {says}, allowed: 4 lines of 12 positive resistances in ohms"
 
 
+@pytest.mark.long
 def test_a_baseline_of_a_file_is_written_to_the_node_once(
     hand: HandConfig, rack: Rack, listener: CanPort, tmp_path: Path
 ) -> None:
@@ -288,6 +291,7 @@ def test_nodes_fall_silent_when_a_master_with_a_heartbeat_is_killed(
         assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("node_id", [255, 9])
 def test_a_patch_without_its_node_id_is_found_by_its_serial_number(
     crossing_hand: HandConfig, rack_of: Callable[[HandConfig], Rack], node_id: int

@@ -266,6 +266,7 @@ def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:
     assert all(len(times) == 1 for times in by_scan.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code_bits", [16, 24])
 def test_fields_over_can_fd_are_those_of_a_classic_bus(code_bits: int) -> None:
     """The same pressed patch on two buses of one hand: the same codes, so the same fields to the last bit."""

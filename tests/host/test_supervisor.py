@@ -135,6 +135,7 @@ def test_heartbeats_of_an_earlier_period_are_no_second_node(
         assert not host.health("p0").duplicate_id
 
 
+@pytest.mark.long
 def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, rack: Rack) -> None:
     """After a reset it sends no heartbeat either."""
     with Host.from_config(hand) as host:
@@ -166,6 +167,7 @@ def test_searches_for_absent_nodes_do_not_delay_a_node_that_is_back(
             assert clock.monotonic() - begun_s < BACK_S
 
 
+@pytest.mark.long
 def test_a_node_that_restarts_in_a_loop_is_taken_up_when_it_has_calmed_down(
     hand: HandConfig, rack: Rack
 ) -> None:
@@ -197,6 +199,7 @@ def test_start_without_a_patch_that_comes_later(
     assert eventually(lambda: node.nmt_state is NmtState.PRE_OPERATIONAL)
 
 
+@pytest.mark.long
 def test_start_with_nobody_there(hand: HandConfig, rack_of: Callable[[HandConfig], Rack]) -> None:
     rack = rack_of(hand)
     with Host.from_config(waiting(hand), boot_deadline_s=0.2) as host:

@@ -226,6 +226,7 @@ def test_a_sphere_that_slides_over_a_turned_patch() -> None:
     )
 
 
+@pytest.mark.long
 def test_on_a_fingertip_the_force_follows_the_normal_at_the_contact() -> None:
     """Off the middle of a cylinder, where the normal is not the z axis of the patch."""
     radius_m = 20e-3

@@ -50,6 +50,7 @@ def test_json_of_a_hand_that_is_not_there_is_a_fault(tmp_path: Path, seconds: st
     assert done.stderr.splitlines() == ["fault: p0: never seen", "fault: p1: never seen"]
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_json_of_a_recording(tmp_path: Path) -> None:
     hand, path = a_hand(2, sync={"period_ms": 200}), tmp_path / "run.log"

@@ -299,6 +299,7 @@ class TestFastscan:
         assert [slave.state for slave in slaves] == [0, 1, 0]
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.one_of(st.binary(max_size=8), st.binary(min_size=8, max_size=8)), max_size=20))
 def test_whatever_comes(frames: list[bytes]) -> None:

@@ -106,6 +106,7 @@ def test_upload_arrives_whole(value: bytes, sizes: list[int], fate: list[int]) -
     assert bench.server.deadline_ns == NO_DEADLINE_NS
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=200)
 @given(values, block_sizes, st.lists(st.booleans(), max_size=100))
 def test_upload_gets_over_a_queue_that_is_full(value: bytes, sizes: list[int], busy: list[bool]) -> None:
@@ -203,6 +204,7 @@ def test_download_arrives_whole_or_is_aborted(value: bytes, announce: bool, fate
     assert bench.server.deadline_ns == NO_DEADLINE_NS
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=200)
 @given(values, st.booleans(), fates)
 def test_download_arrives_whole_if_blocks_reach_their_ends(
@@ -213,6 +215,7 @@ def test_download_arrives_whole_if_blocks_reach_their_ends(
     assert bench.written == [value]
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=200)
 @given(values, st.integers(-20, 20), st.booleans(), st.booleans())
 def test_download_of_another_length_is_refused(

@@ -144,6 +144,7 @@ def test_an_mcap_file_gets_the_fields_that_a_replay_computes(recorded: Path, tmp
     assert (plain.frames, plain.fields) == (done.frames, 0)
 
 
+@pytest.mark.long
 def test_a_table_holds_the_fields_and_the_resistances(recorded: Path, tmp_path: Path) -> None:
     done = convert(recorded, tmp_path / "x.parquet")
     table = pq.read_table(tmp_path / "x.parquet").to_pylist()
@@ -249,6 +250,7 @@ def test_a_missing_viewer_is_said_of_the_target(
     assert str(done.exception).startswith("target: got no package rerun-sdk, allowed: ")
 
 
+@pytest.mark.long
 def test_a_damaged_source_is_converted_as_far_as_it_is_whole(recorded: Path, tmp_path: Path) -> None:
     source, target = tmp_path / "run.log", tmp_path / "x.mcap"
     source.write_bytes(recorded.read_bytes()[:-500])

@@ -111,6 +111,7 @@ def test_a_recording_that_lacks_a_layout_file_is_not_solved_with_another_layout(
     assert "lacks the layout file of p0; solve it with skinnode resolve" in complaint
 
 
+@pytest.mark.long
 def test_the_layout_file_can_be_given_later(recorded: Recorded, tmp_path: Path) -> None:
     path, live = recorded
     recording, hand = recording_at(as_an_older_version_wrote_it(path, tmp_path), None)

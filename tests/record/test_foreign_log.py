@@ -113,6 +113,7 @@ def test_with_the_baselines_it_gives_the_fields_of_the_host(
     assert worst_m < 1e-12  # the same codes and baselines; the solver may have begun with another scan
 
 
+@pytest.mark.long
 def test_a_sync_missing_from_the_log_changes_no_scan_number(tmp_path: Path) -> None:
     """Its counter was that of a SYNC one round before."""
     sync = SyncConfig(period_ms=25, counter_overflow=8)
@@ -129,6 +130,7 @@ def test_a_sync_missing_from_the_log_changes_no_scan_number(tmp_path: Path) -> N
     assert all(t_ns in (0, one.t_sync_ns) for t_ns, one in zip(times, whole, strict=True) if one)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".log", ".mcap"])
 def test_a_hand_file_never_replaces_a_journal(recorded: Path, tmp_path: Path, suffix: str) -> None:
     """The journal knows the baselines and what the host decided; without it, other fields would result."""

@@ -203,6 +203,7 @@ def test_mcap_ros2_support_reads_every_message_that_rosbags_reads(run: Any) -> N
     assert all(force_z < 0 for force_z, _ in wrenches)  # pressed into the skin
 
 
+@pytest.mark.long
 def test_a_wrench_acts_at_the_position_of_its_contact(run: Any) -> None:
     """The torque about the origin of the patch is the cross product of position and force."""
     path, *_ = run

@@ -93,6 +93,7 @@ def play(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Play:
     return play
 
 
+@pytest.mark.long
 def test_a_whole_recording_has_no_fault(recorded: Recorded, play: Play) -> None:
     played = play(recorded.log, recorded.journal)
     assert (played.status, played.faults, played.error) == (0, [], "")

@@ -20,6 +20,7 @@ from tests.remote.ports import free_ports
 pytestmark = pytest.mark.system_time
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the program openssl")
 def test_only_the_operator_commands_and_only_with_a_certificate(
     start: Callable[..., Process], tmp_path: Path

@@ -39,6 +39,7 @@ def test_a_publication_ends_with_its_host_and_is_closed_more_than_once(port: int
         claim.close()
 
 
+@pytest.mark.long
 def test_programs_get_the_electrodes_of_a_node_that_appears_later(port: int, session: Any) -> None:
     """The layout of each field is known before the field arrives, and the published points stand on it."""
 

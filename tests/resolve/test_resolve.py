@@ -259,6 +259,7 @@ def test_parts_of_another_version_are_not_used(
     assert len(job_of(recording, tmp_path).units(parts)) == every
 
 
+@pytest.mark.long
 def test_the_order_of_the_fields_does_not_depend_on_how_the_buses_are_divided(recording: Path) -> None:
     """A command may continue with another number of processes, and then reads parts of both divisions."""
     opened, hand = recording_at(recording, None)

@@ -152,6 +152,7 @@ def test_friction_of_a_sphere_is_that_of_cattaneo_and_mindlin() -> None:
     assert not state.sticks.any()
 
 
+@pytest.mark.long
 def test_friction_points_against_the_slide_and_never_exceeds_its_limit() -> None:
     layer, friction = Layer(2e-3, 1e6, 0.45), 0.4
     grid, places = square(layer, 32)

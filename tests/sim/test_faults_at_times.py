@@ -209,6 +209,7 @@ def test_an_unplugged_patch_falls_silent_at_once(virtual: VirtualClock) -> None:
         assert fleet.tally("palm").emitted.total() <= sent + 1  # a frame that the node had begun
 
 
+@pytest.mark.long
 def test_faults_repeat_with_the_scene(virtual: VirtualClock) -> None:
     plan = scene({"where": "palm", "fault": "frozen", "from_s": 0.1, "to_s": 0.2}, repeat_s=0.5)
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
@@ -338,6 +339,7 @@ def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> No
     assert fleet.faults.log == ()
 
 
+@pytest.mark.long
 def test_a_fleet_of_real_time_plays_its_faults_in_virtual_time() -> None:
     fleet = Fleet(HAND, scene=scene({"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 0.4}))
     with VirtualClock(), fleet, sk.Host.from_config(HAND):

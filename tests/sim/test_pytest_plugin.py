@@ -192,6 +192,7 @@ def test_bad_use_is_one_line(tmp_path: Path) -> None:
     assert "ConfigError: loss: got an unknown fault, allowed: one of seed, lost, " in printed
 
 
+@pytest.mark.long
 def test_pytest_starts_without_numpy_and_numba(tmp_path: Path) -> None:
     (tmp_path / "test_light.py").write_text(
         "import sys\n\n\ndef test_light():\n    assert not {'numpy', 'numba', 'can'} & set(sys.modules)\n"

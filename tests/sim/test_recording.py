@@ -108,6 +108,7 @@ def test_the_truth_of_each_scan(recorded: tuple[Path, str, dict[int, Any]]) -> N
     assert (np.diff(found["palm time_ns"]) > 0).all()
 
 
+@pytest.mark.long
 def test_the_faults_and_the_scene(recorded: tuple[Path, str, Any]) -> None:
     folder = recorded[0]
     lines = [json.loads(line) for line in (folder / FAULTS).read_text().splitlines()]

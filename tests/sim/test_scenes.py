@@ -188,6 +188,7 @@ def test_wrench_is_that_of_the_tractions(slide: PatchScene) -> None:
     np.testing.assert_allclose(truth.wrench[3:], moment, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_touch_by_force_reaches_the_force(slide: PatchScene) -> None:
     for t in (0.5, 0.8, 1.1, 1.5, 1.7):
         assert -slide.truth(t).contacts[0].force_n[2] == pytest.approx(2.0, rel=0.005)
@@ -398,6 +399,7 @@ def test_bodies_as_near_as_allowed_hardly_move_each_others_skin() -> None:
     assert abs(moved[0, 2]) < 0.03 * 3e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cells", [20, 40])
 def test_the_electrodes_move_as_the_response_of_each_cell_says(cells: int) -> None:
     """Against the sum over all cells of the response of a cell, for each electrode, while the body slides."""

@@ -51,6 +51,7 @@ def press(depth: float) -> Float:
     return contact.displacement_m(points).reshape(LAYOUT.upper_m.shape)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", some_long(["exact", "posterior"], "posterior"))
 @pytest.mark.parametrize("layer", ["upper", "lower"])
 @pytest.mark.parametrize("other", some_long([1, 2], 1))

@@ -129,6 +129,7 @@ def test_a_fault_is_named_although_the_deadline_never_leaves_time_to_examine_it(
         assert off(field, press(0.1)) < 5.0
 
 
+@pytest.mark.long
 def test_a_patch_that_keeps_still_is_examined_when_there_is_time(monkeypatch) -> None:
     tracker = sk.Tracker(LAYOUT, method="exact", relative_noise=NOISE, deadline_us=5_000_000)
     frame = readings(press(0.1), np.random.default_rng(3))
@@ -189,6 +190,7 @@ def test_half_of_the_readings_are_not_enough_and_the_reason_says_so() -> None:
     assert field.distrust == f"only {valid.mean():.0%} of the readings are usable"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", some_long(["exact", "posterior"], "posterior"))
 def test_noise_larger_than_stated_is_not_taken_for_wrong_readings(method: str) -> None:
     """Until it has been estimated, no field is trusted; no reading is ever named."""

@@ -44,6 +44,7 @@ def test_the_share_is_that_of_the_full_covariances(skin: Skin) -> None:
     assert field.data_share.max() <= 1.0
 
 
+@pytest.mark.long
 def test_the_more_readings_are_lost_the_less_comes_from_the_data(skin: Skin) -> None:
     shares = []
     for kept in (30, 15, 5):

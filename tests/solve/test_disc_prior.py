@@ -165,6 +165,7 @@ def test_errors_on_a_bonded_layer_are_within_the_claim(skin, family):
         assert (error <= field.half_width_95_m).mean() > 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("family", "number", "name"), [("ridge", 1001, "staggered"), ("two", 1019, "aligned")]
 )
@@ -199,6 +200,7 @@ def test_a_single_electrode_that_the_readings_hardly_show_is_within_the_claim(na
         assert field.displacement_std_m.max() < 0.2 * skin.layout.height_m
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", [1e-5, 1e-3])
 def test_a_deep_press_between_two_frames_is_not_taken_for_another_field(skin, sigma):
     for seed in range(4):

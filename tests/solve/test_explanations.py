@@ -57,6 +57,7 @@ def frame(model, kind, sigma, seed):
     return z, present
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", some_long([1e-5, 1e-6], 1e-6))
 @pytest.mark.parametrize("kind", some_long(KINDS, "healthy", "reading", "crossed"))
 def test_decisions_do_not_depend_on_stopping_early(model, kind, sigma):

@@ -173,6 +173,7 @@ def off(field: sk.FieldFrame, truth_m: np.ndarray) -> np.ndarray:
     return np.abs((field.displacement_m - truth_m)[solved] / field.displacement_std_m[solved])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", some_long(["staggered", "aligned"], "staggered"))
 def test_the_claim_covers_a_patch_made_to_its_tolerances(kind):
     """Without tolerances, the same readings are dozens of deviations off."""
@@ -193,6 +194,7 @@ def test_the_claim_covers_a_patch_made_to_its_tolerances(kind):
     assert found[EXACT].max() > 15.0
 
 
+@pytest.mark.long
 def test_a_press_in_small_steps_has_the_claim_of_a_sudden_one():
     """The effects grow with the press, and the factors must follow them."""
     layout = SMALL

@@ -189,6 +189,7 @@ def test_missing_resistances_cost_certainty_not_truth(staggered, lost):
         assert (np.isinf(field.residual) == ~valid.any(axis=1)).all()
 
 
+@pytest.mark.long
 def test_a_value_that_is_no_resistance_is_the_same_as_a_missing_one(staggered):
     rng = np.random.default_rng(4)
     frame = noisy(frame_ohm(staggered, hertz_press(staggered, 0.2)), rng)
@@ -205,6 +206,7 @@ def test_a_value_that_is_no_resistance_is_the_same_as_a_missing_one(staggered):
 BAD = ["nan", "inf", "negative", "zero", "huge", "tiny", "garbage", "not valid", "noise unknown", "shuffled"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", some_long(BAD, "nan", "garbage"))
 def test_a_bad_frame_is_not_believed_and_the_next_is_solved(staggered, kind):
     rng = np.random.default_rng(6)
@@ -277,6 +279,7 @@ def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
         assert np.sqrt(np.mean(z**2)) < 1.15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("height", "sigma", "seed"), some_long([(0.5, 1e-5, 48), (1.0, 1e-6, 40)], (0.5, 1e-5, 48))
 )
@@ -488,6 +491,7 @@ def test_residual_is_that_of_the_reference_model(staggered, options):
     np.testing.assert_allclose(field.residual, np.sqrt((found**2).mean(axis=1)), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_a_slow_drift_below_the_noise_is_not_held_forever(staggered):
     """A press that grows by less than its deviation a frame: held, it never falls 5 deviations behind."""
     rng = np.random.default_rng(12)

@@ -113,6 +113,7 @@ def test_a_press_that_deepens_in_ten_seconds_is_found() -> None:
     assert all(touched[100:])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", some_long([1e-3, 1e-5], 1e-5))
 def test_creep_after_a_release_ends(noise: float) -> None:
     """A tenth of a press of 30 % remains and decays in half a minute; a new press is found all the same."""

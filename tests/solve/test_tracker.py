@@ -48,6 +48,7 @@ def test_exact_method_is_the_exact_tracker(layout):
         exact.reset()
 
 
+@pytest.mark.long
 def test_a_stream_waits_for_no_table_after_preparation(monkeypatch):
     """Touched, untouched, and with a wrong reading at which explanations are sought, at the stated noise."""
     layout = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_electrodes=5)
@@ -408,6 +409,7 @@ def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout,
     np.testing.assert_allclose(field.displacement_m, moved, atol=1e-3 * layout.height_m)
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([16, 24]), st.booleans(), st.booleans())
 def test_codes_are_solved_as_the_resistances_that_they_stand_for(

@@ -143,6 +143,7 @@ def test_a_fault_stays_listed_while_the_noise_is_estimated_in_each_frame() -> No
     assert len(since) == 1
 
 
+@pytest.mark.long
 def test_a_repaired_reading_is_used_again_however_often_it_was_wrong() -> None:
     shape = LAYOUT.shape
     faults, group = FaultList(shape), Group(FaultyPart.CROSSING, 2, 7, 50.0)

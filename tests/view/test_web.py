@@ -120,6 +120,7 @@ def test_another_name_of_this_computer_is_kept_and_a_forged_one_is_not(files: in
         assert "http://127.0.0.1:5555" in head["Content-Security-Policy"]
 
 
+@pytest.mark.long
 def test_files_of_the_viewer_are_passed_on_and_no_others(files: int) -> None:
     port = free_port()
     with WebPage(LOCAL, port, 5555, files):

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -141,6 +142,12 @@ def tared(hand: sk.RunningHand, patch: str) -> bool:
     return True
 
 
+def is_suspended(pid: int) -> bool:
+    """Whether all threads have stopped; some of them run on for a moment after the signal."""
+    stats = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/stat")]
+    return all(text.rpartition(")")[2].split()[0] == "T" for text in stats)
+
+
 def test_a_daemon_that_was_suspended_does_not_execute_what_was_given_up(
     start: Callable[..., Process], port: int
 ) -> None:
@@ -148,6 +155,7 @@ def test_a_daemon_that_was_suspended_does_not_execute_what_was_given_up(
     with sk.connect("hand", port=port) as hand:
         daemon.process.send_signal(signal.SIGSTOP)
         try:
+            eventually(lambda: is_suspended(daemon.process.pid))
             with pytest.raises(SkinError, match=r"no reply to tare within 2 s"):
                 hand.tare("p0", deadline_s=0.0)
         finally:

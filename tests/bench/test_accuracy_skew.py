@@ -32,6 +32,7 @@ def test_a_body_is_pressed_slides_and_is_released_at_the_stated_speed(speed_m_s)
     assert not body.moves(pressed, slide)
 
 
+@pytest.mark.long
 def test_a_scan_contains_each_wire_at_its_own_time():
     skin = Skin(preset(*accuracy_skew.LAYOUT))
     body = accuracy_skew.motion("punch", 1, skin, 1e-2, 0.02)

@@ -53,6 +53,7 @@ def test_solve_compares_with_every_peer_at_the_same_accuracy(tmp_path):
         assert row["who"] in output
 
 
+@pytest.mark.long
 def test_node_tells_how_late_it_was_and_what_a_frame_costs(tmp_path):
     """That something was measured: times are no business of a test."""
     file = tmp_path / "figures.json"

@@ -90,6 +90,7 @@ def test_plot_is_drawn(outcome):
     assert len(image) > 50_000
 
 
+@pytest.mark.long
 def test_the_counted_quantities_are_those_of_the_solver():
     layout = _bench_path.preset("staggered", 0.5)
     one = _bench_path.experiments(layout, 0.1, 1)[0]

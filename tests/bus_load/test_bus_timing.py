@@ -76,6 +76,7 @@ def test_remote_frames_as_on_the_naive_bus(can_id: int, dlc: int) -> None:
     assert exact_bits(can_id, b"", remote=True, dlc=dlc) == expected
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=100)
 @given(can_id=st.integers(0, (1 << 29) - 1), data=DATA)
 def test_extended_frames_as_on_the_naive_bus(can_id: int, data: bytes) -> None:
@@ -86,6 +87,7 @@ def test_extended_frames_as_on_the_naive_bus(can_id: int, data: bytes) -> None:
     assert nominal_bits(len(data), extended=True) <= expected <= worst_case_bits(len(data), extended=True)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=50)
 @given(frames=st.lists(st.tuples(STANDARD, DATA), max_size=30), beyond=st.integers(0, 255))
 def test_the_batch_is_the_same_frame_by_frame(frames: list[tuple[int, bytes]], beyond: int) -> None:

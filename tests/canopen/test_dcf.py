@@ -51,6 +51,7 @@ def written(profile: PatchProfile) -> dict[tuple[int, int], int]:
     }
 
 
+@pytest.mark.long
 def test_dcfchk_accepts_it_without_a_word(file: Path) -> None:
     tool = shutil.which("dcfchk", path=str(Path(sys.executable).parent)) or shutil.which("dcfchk")
     assert tool is not None
@@ -58,6 +59,7 @@ def test_dcfchk_accepts_it_without_a_word(file: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+@pytest.mark.long
 def test_dcf_tools_know_node_and_values(file: Path, profile: PatchProfile) -> None:
     device = dcf.Device.from_dcf(str(file))  # the node-ID is the file's own
     assert device.node_id == NODE_ID

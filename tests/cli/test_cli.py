@@ -164,6 +164,7 @@ def test_wrong_usage_is_one_line_and_status_2(arguments: str, line: str) -> None
     assert said.startswith(f"error: {line}")
 
 
+@pytest.mark.long
 def test_wrong_usage_of_the_installed_command() -> None:
     done = skinnode("scan", "--bitrate", "x")
     said = "error: skinnode scan: --bitrate: got 'x', allowed: an integer\n"

@@ -245,6 +245,7 @@ WITH_AN_END = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "number"),
     some_long(zip(WITH_AN_END, cycle(SIGNALS), strict=False), ("demo", SIGNALS[0]), ("scan", SIGNALS[1])),

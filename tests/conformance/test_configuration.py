@@ -43,6 +43,7 @@ def configure(dut: Dut) -> None:
     dut.prepare()
 
 
+@pytest.mark.long
 def test_a_stored_configuration_is_found_again(dut: Dut) -> None:
     configure(dut)
     before = {key: dut.sdo.read(*key) for key in FOUND}

@@ -255,6 +255,7 @@ def test_a_node_that_no_host_has_configured_is_no_fault(hand_file: HandFile, on:
     assert not slow
 
 
+@pytest.mark.long
 def test_a_default_inhibit_time_is_a_fault_once_the_node_runs(hand_file: HandFile, on: On) -> None:
     """Another master may have started it without configuring it."""
     file = hand_file()

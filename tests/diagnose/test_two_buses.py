@@ -46,6 +46,7 @@ def test_a_patch_is_found_on_its_bus(two_buses: Path) -> None:
     assert (change["bus"], change["node_id"], change["followed"]) == ("right", 5, True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command",
     [["info", "5"], ["od", "5", "1018:4"], ["nmt", "5", "start"]],

@@ -257,6 +257,7 @@ def test_patches_are_back_within_a_second(running: Running, wave: tuple[Attack, 
         assert "\n" not in said[name]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("off_s", some_long([0.05, 0.2, 1.5], 1.5))
 def test_bus_off(running: Running, off_s: float) -> None:
     running.fleet.bus_off("can0", off=True)

@@ -132,6 +132,7 @@ def test_a_converter_at_half_the_rate_of_the_scans_is_soon_trusted() -> None:
     assert distrusted == 1
 
 
+@pytest.mark.long
 def test_quiet_patch_at_rest_that_says_nothing() -> None:
     """At rest every code is in the middle of its step: what is live at 2e-6 looks as what is frozen."""
     patch = Patch()

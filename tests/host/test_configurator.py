@@ -390,6 +390,7 @@ def with_eds(hand: HandConfig, path: Path) -> HandConfig:
     return hand.model_copy(update={"patches": patches})
 
 
+@pytest.mark.long
 def test_eds_of_the_profile_is_accepted(hand: HandConfig, fleet: Fleet, tmp_path: Path) -> None:
     path = tmp_path / "patch.eds"
     path.write_text(eds_text(PatchProfile.from_layout(LAYOUT)))

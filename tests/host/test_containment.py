@@ -192,6 +192,7 @@ def test_a_defect_in_serving_a_patch_costs_that_patch_while_it_lasts(
     assert lines[1].exc_info
 
 
+@pytest.mark.long
 def test_what_only_a_bring_up_mends_is_mended(
     hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -299,6 +300,7 @@ def taken(events: Any) -> Iterator[Any]:
     return iter(lambda: events.get(0.0), None)
 
 
+@pytest.mark.long
 def test_a_bus_whose_receiving_is_defective_is_opened_again(
     make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
 ) -> None:

@@ -124,6 +124,7 @@ def endless_node_after(rack: Rack, port: CanPort) -> Iterator[Callable[[], None]
         yield swap
 
 
+@pytest.mark.long
 def test_a_host_names_such_a_node_and_serves_the_others(
     make_hand: Callable[..., HandConfig],
     rack_of: Callable[[HandConfig], Rack],

@@ -145,6 +145,7 @@ def test_short_and_remote_frames(running: Hand) -> None:
     assert counted.scans_torn == injected.scans_spoilt
 
 
+@pytest.mark.long
 def test_heartbeats_that_are_too_long(running: Hand) -> None:
     running.fleet.inject(Faults(long=1.0), "p0")
     assert eventually(lambda: running.fleet.injected("p0").long == 2)  # three would make it lost

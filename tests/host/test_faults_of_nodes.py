@@ -97,6 +97,7 @@ def test_deaf_node_is_stale(running: Hand) -> None:
     assert running.hears("p0", "operational")
 
 
+@pytest.mark.long
 def test_node_reset_in_the_middle_of_a_scan(running: Hand) -> None:
     boot_ups = running.host.health("p0").boot_ups
     running.inject(Faults(reset=1.0))
@@ -181,6 +182,7 @@ def test_foreign_babbling_node(running: Hand) -> None:
     assert health.foreign_ids == (0x3F0,)
 
 
+@pytest.mark.long
 def test_bus_off_and_recovery(make_hand: Callable[..., HandConfig]) -> None:
     hand = make_hand()
     with Fleet(hand) as fleet, Host.from_config(hand) as host:

@@ -126,6 +126,7 @@ def test_part_without_the_noise_of_all_others(at, part, upper, lower) -> None:
         assert patch.see(codes).faults == ()
 
 
+@pytest.mark.long
 def test_few_noisy_crossings_do_not_condemn_the_others() -> None:
     """A converter with coarser steps than its codes, of which some values lie on the edge of a step."""
     patch, random = Patch(1e-4), np.random.default_rng(3)

@@ -180,6 +180,7 @@ def test_interrupted_while_it_waits_for_nodes(shared: tuple[Path, BusConfig]) ->
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.long
 def test_wrong_length_is_one_line_and_status_2(shared: tuple[Path, BusConfig]) -> None:
     path, bus = shared
 

@@ -16,6 +16,7 @@ from skinnode.transport import CanPort
 from .conftest import Rack, eventually, heard
 
 
+@pytest.mark.long
 def test_a_node_that_sends_scans_is_asked_nothing(hand: HandConfig, rack: Rack, listener: CanPort) -> None:
     """Its configuration is read back only if its scans stop: see 0.4 s in the remote node."""
     with Host.from_config(hand) as host:
@@ -31,6 +32,7 @@ def test_a_node_that_sends_scans_is_asked_nothing(hand: HandConfig, rack: Rack, 
         assert {name: defects.count for name, defects in host.stats().defects.items() if defects.count} == {}
 
 
+@pytest.mark.long
 def test_the_configuration_of_a_node_that_sends_no_scan_is_read_back_once_a_second(
     hand: HandConfig, rack_of: Callable[[HandConfig], Rack], listener: CanPort
 ) -> None:

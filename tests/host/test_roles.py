@@ -245,6 +245,7 @@ def test_a_baseline_of_a_file_is_written_to_the_node_once(
     assert downloads == []  # it has them already
 
 
+@pytest.mark.long
 def test_coordinates_come_from_the_node(hand: HandConfig, rack_of: Callable[[HandConfig], Rack]) -> None:
     """A patch made another way than the preset that stands for it."""
     rack = rack_of(hand)

@@ -103,6 +103,7 @@ def test_nothing_is_computed_between_the_configuration_of_the_nodes_and_their_st
     assert before == [touch_test._thresholds.cache_info().misses]
 
 
+@pytest.mark.long
 def test_a_patch_is_solvable_if_its_solver_options_make_it_so(make_hand: Callable[..., HandConfig]) -> None:
     """Eight lower wires are too few for the 12 unknowns of a wire, but enough for its four heights."""
     layout, solver = {**SMALL, "lower_wires": 8}, {"method": "exact", "normal_only": True}

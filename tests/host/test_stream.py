@@ -213,6 +213,7 @@ def test_silence_is_a_timeout_and_a_lost_patch(hand: HandConfig) -> None:
         assert eventually(lambda: host.health("p0").condition is Condition.LOST)
 
 
+@pytest.mark.long
 def test_node_that_restarts_by_itself(hand: HandConfig, rack: Rack, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING), Host.from_config(hand) as host:
         take(host.fields(timeout_s=10), 4)
@@ -339,6 +340,7 @@ def test_simulated_hand_over_can_fd(make_hand: Callable[..., HandConfig]) -> Non
     assert stats.buses["can0"].ignored == 0
 
 
+@pytest.mark.long
 def test_patch_of_fewer_wires_than_unknowns_is_solved_with_its_prior(
     make_hand: Callable[..., HandConfig],
 ) -> None:

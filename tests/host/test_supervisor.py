@@ -89,6 +89,7 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         assert gaps(numbers) <= other.skipped + missed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "booted"), some_long([(0x81, 1), (0x82, 1), (0x80, 0), (0x02, 0)], (0x81, 1), (0x02, 0))
 )
@@ -125,6 +126,7 @@ def test_resets_that_the_host_commands_are_no_restart_loop(
     assert "restarted without a command" not in caplog.text
 
 
+@pytest.mark.long
 def test_heartbeats_of_an_earlier_period_are_no_second_node(
     hand: HandConfig, rack: Rack, listener: CanPort
 ) -> None:
@@ -209,6 +211,7 @@ def test_start_with_nobody_there(hand: HandConfig, rack_of: Callable[[HandConfig
             take(host.fields(timeout_s=10, patch=name), 2)
 
 
+@pytest.mark.long
 def test_another_patch_in_its_place_is_refused_until_the_right_one_comes(
     hand: HandConfig, rack: Rack, listener: CanPort
 ) -> None:

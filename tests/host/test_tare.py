@@ -48,6 +48,7 @@ class Mute:
         return not (self.active and can_id in (0x185, 0x285))
 
 
+@pytest.mark.long
 def test_a_tare_by_others_is_followed_though_the_scan_that_announces_it_is_lost(
     hand: HandConfig, rack: Rack, listener: CanPort
 ) -> None:
@@ -148,6 +149,7 @@ def test_a_tare_returns_when_the_new_baseline_is_in_use(hand: HandConfig, rack: 
         assert host.health("p1").baselines == 0
 
 
+@pytest.mark.long
 def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
     hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,7 @@ def test_a_press_pushes_the_rubber_next_to_it_outwards_and_up() -> None:
     assert normal[1] < -0.1 * normal[0]
 
 
+@pytest.mark.long
 def test_the_volume_stays() -> None:
     r = np.linspace(0.0, 40e-3, 4001)
     normal, _ = bonded_layer_compliance(RUBBER, 2e-3, r, RADIUS_M)

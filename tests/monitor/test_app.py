@@ -86,6 +86,7 @@ def test_shear_is_an_arrow_the_way_it_goes() -> None:
         in_app(source, play)
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_a_dead_node_is_named_and_its_last_map_is_not_taken_for_now() -> None:
     hand = a_hand()
@@ -110,6 +111,7 @@ def test_a_dead_node_is_named_and_its_last_map_is_not_taken_for_now() -> None:
     assert not any(line.startswith("p0: lost") for line in app.faults.lines)
 
 
+@pytest.mark.long
 def test_tare_asks_and_then_zeroes() -> None:
     hand = a_hand()
     with closing(Pressed(hand)) as skin, Host.from_config(hand) as host, HostSource(host) as source:
@@ -208,6 +210,7 @@ def test_a_recording_that_cannot_be_is_told_and_the_screen_goes_on(tmp_path: Pat
         in_app(source, play, folder=tmp_path / "taken", size=(120, 40))
 
 
+@pytest.mark.long
 def test_a_recording_that_the_disk_has_ended_is_a_fault_also_when_the_screen_is_left(tmp_path: Path) -> None:
     hand = a_hand(1)
     kept = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -41,6 +41,7 @@ def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
     assert 0 < newest["latency_s"] < 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", ["1", "3.2"])
 def test_json_of_a_hand_that_is_not_there_is_a_fault(tmp_path: Path, seconds: str) -> None:
     done = run(str(write_hand(tmp_path, a_hand(2))), "--json", "--seconds", seconds)
@@ -67,6 +68,7 @@ def test_json_of_a_recording(tmp_path: Path) -> None:
     assert solved > 4
 
 
+@pytest.mark.long
 def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
     """As `skinnode replay` says of it: killed, and damaged."""
     hand, path = a_hand(1, sync={"period_ms": 100}), tmp_path / "run.log"

@@ -156,6 +156,7 @@ def the_view(source: HostSource, history: History, until: float = 8.0) -> View:
     return view
 
 
+@pytest.mark.long
 def test_touches_and_rates_are_those_of_the_scene() -> None:
     hand = a_hand(1, simulation={"seed": 3, "depth": 0.2, "cycle_s": 2.0, "indenter_radius_m": 0.02})
     with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
@@ -182,6 +183,7 @@ def test_touches_and_rates_are_those_of_the_scene() -> None:
     assert report["buses"]["can0"]["level"] == "good"
 
 
+@pytest.mark.long
 def test_the_posterior_tells_forces() -> None:
     hand = a_hand(1, solver={"method": "posterior"}, simulation={"depth": 0.3, "indenter_radius_m": 0.02})
     with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:
@@ -192,6 +194,7 @@ def test_the_posterior_tells_forces() -> None:
     assert patch.touches[0].force_n > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("colours", some_long(["rgb", "ansi", "none"], "rgb"))
 @pytest.mark.parametrize("patches", some_long([1, 3, 16], 1, 3))
 def test_every_line_has_its_width_at_every_size(patches: int, colours: Colours) -> None:
@@ -280,6 +283,7 @@ def test_a_patch_that_cannot_be_brought_up_says_why() -> None:
     assert judge_patch(refused, []) == ("refused", "bad", (why,))
 
 
+@pytest.mark.long
 def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> None:
     hand = a_hand(2, sync={"period_ms": 200})
     with (

@@ -235,6 +235,7 @@ class TestOneOwner:
         FileMemory(path).claim()  # its end releases it as well
         assert os.listdir(path.parent) == []
 
+    @pytest.mark.long
     def test_an_owner_that_was_killed_is_in_nobodys_way(self, path: Path) -> None:
         with subprocess.Popen(
             [sys.executable, "-c", OWNER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -298,6 +298,7 @@ def test_fixed_pdos_of_four_codes_each(make: Callable, layout) -> None:
 
 
 class TestMany:
+    @pytest.mark.long
     def test_the_last_ones_work(self, make: Callable) -> None:
         desk = make(profile=MANY)
         desk.configure_pdo(0x19FF, REGISTER, cob_id=0x3F0, kind=255, timer=10)

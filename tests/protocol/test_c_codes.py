@@ -117,6 +117,7 @@ def expected_ratio(resistance: int, baseline: int, bits: int) -> int:
     return code if 0 <= code <= steps else steps + 1
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=400)
 @given(value=st.integers(0, (1 << 64) - 1) | st.integers(0, 1 << 26), fraction_bits=st.integers(0, 63))
 def test_baselines_are_rounded_to_real32_as_numpy_does(kit: Kit, value: int, fraction_bits: int) -> None:

@@ -74,6 +74,7 @@ def test_eds_holds_the_reference_files_and_nothing_else() -> None:
     assert {file.name for file in EDS.iterdir()} == {eds_name(reference) for reference in REFERENCE_PROFILES}
 
 
+@pytest.mark.long
 @by_few_profiles
 def test_dcfchk_accepts_the_eds_without_a_word(profile: PatchProfile, tmp_path: Path) -> None:
     file = tmp_path / eds_name(profile)

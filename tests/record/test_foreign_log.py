@@ -161,6 +161,7 @@ def test_frames_of_another_bus_are_left_out(recorded: Path, tmp_path: Path) -> N
         assert done.faults == (f"{len(lines)} frames on channels not used by any bus of the hand",)
 
 
+@pytest.mark.long
 def test_without_baselines_it_says_so_and_is_close(recorded: Path, tmp_path: Path) -> None:
     ours = replay(recorded)
     wanted = by_time(list(ours), ours.wall_minus_mono_ns)

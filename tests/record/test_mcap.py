@@ -435,6 +435,7 @@ def test_a_missing_extra_is_one_line_with_what_to_install(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_the_command_tells_how_many_fields_it_wrote(tmp_path: Path) -> None:
     hand = a_hand()
     file, path = tmp_path / "hand.toml", tmp_path / "runs"

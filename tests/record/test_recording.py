@@ -172,6 +172,7 @@ def test_the_wall_clock_jumps_while_it_is_recorded(tmp_path: Path, jump_s: int) 
     assert max(times_s) < time.monotonic()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".log", ".mcap"])
 def test_scans_keep_their_numbers_if_the_counter_wraps_while_no_sync_can_be_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str

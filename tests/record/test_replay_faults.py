@@ -144,6 +144,7 @@ def test_a_log_that_is_there_twice_has_too_many(recorded: Recorded, play: Play) 
     assert f"x.log has {2 * frames} frames, but {frames} were recorded" in played.faults
 
 
+@pytest.mark.long
 def test_a_recording_that_was_killed_says_how_far_it_reads(recorded: Recorded, play: Play) -> None:
     assert recorded.journal[-1]["event"] == "ended"
     whole = play(recorded.log, recorded.journal)

@@ -293,6 +293,7 @@ def foreign(recording: Path, folder: Path, lines: str = "") -> tuple[Path, Path]
     return log, plan
 
 
+@pytest.mark.long
 def test_parts_of_another_baseline_are_not_used(recording: Path, tmp_path: Path) -> None:
     """Neither by the next run, nor by a worker of this run that sees the new file."""
     layout = PatchLayout.preset(
@@ -320,6 +321,7 @@ def test_parts_of_another_baseline_are_not_used(recording: Path, tmp_path: Path)
         units.run_unit(changed.solves[0], str(tmp_path), identity(), "a worker")
 
 
+@pytest.mark.long
 def test_a_layout_file_is_found_from_any_folder(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

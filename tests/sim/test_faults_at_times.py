@@ -219,6 +219,7 @@ def test_faults_repeat_with_the_scene(virtual: VirtualClock) -> None:
     assert [text.rpartition(" ")[2] for _, text in found] == ["on", "off"] * 4
 
 
+@pytest.mark.long
 def test_a_schedule_changes_its_own_faults_only(virtual: VirtualClock) -> None:
     plan = scene({"where": "palm", "fault": "late=0.5", "from_s": 0.2, "to_s": 0.4})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
@@ -229,6 +230,7 @@ def test_a_schedule_changes_its_own_faults_only(virtual: VirtualClock) -> None:
         assert fleet.faults.texts() == ["palm:sync_lost=0.1"]
 
 
+@pytest.mark.long
 def test_a_scheduled_change_that_contradicts_is_refused(virtual: VirtualClock) -> None:
     plan = scene({"where": "palm", "fault": "late=0.5", "from_s": 0.2, "to_s": 0.4})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
@@ -253,6 +255,7 @@ def test_a_fault_ends_although_the_next_one_is_refused(virtual: VirtualClock) ->
     assert found == [(0.4, "palm:frozen off"), (0.4, "palm:lost=0.6 on, refused")]
 
 
+@pytest.mark.long
 def test_a_fault_that_goes_on_in_another_table_does_not_pause(virtual: VirtualClock) -> None:
     plan = scene(
         {"where": "palm", "fault": "frozen", "from_s": 0.2, "to_s": 0.4},
@@ -286,6 +289,7 @@ def test_a_patch_drifts_and_warms(virtual: VirtualClock) -> None:
     assert abs(injected.warmed - 1000 / PERIOD_MS) <= 1
 
 
+@pytest.mark.long
 def test_an_error_passive_controller_is_reported(virtual: VirtualClock) -> None:
     plan = scene({"where": "palm", "fault": "error_passive", "from_s": 0.5, "to_s": 1.0})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:

@@ -150,6 +150,7 @@ class Stream:
             self.scans.append(scan)
 
 
+@pytest.mark.long
 def test_a_healthy_stream_is_whole() -> None:
     stream = Stream()
     stream.run(500)
@@ -245,6 +246,7 @@ def test_one_wrong_counter_of_any_value(place: int) -> None:
     stream.assert_none_is_mixed()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", some_long([0, 1, 7, 14, 15], 7))
 def test_counter_of_the_scan_that_comes_as_the_timeout_ends(place: int) -> None:
     """Three scans ahead: its own frame of that place comes a little before or a little after the timeout."""
@@ -318,6 +320,7 @@ def test_a_summary_without_its_check_makes_no_scan_complete() -> None:
     assert frames_counted(counted) == injected.pdos
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wire", some_long(WIRES, WIRES[0]), ids=IDS)
 @pytest.mark.parametrize("seed", some_long(range(2), 0))
 def test_what_a_check_finds_among_all_other_faults(wire: dict[str, Any], seed: int) -> None:

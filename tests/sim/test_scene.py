@@ -35,6 +35,7 @@ def test_a_depth_of_nothing_is_a_hand_at_rest() -> None:
         np.testing.assert_array_equal(play.upper_m(t), LAYOUT.upper_m)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", some_long(range(4), 0))
 def test_a_stroke_presses_slides_and_lifts_as_configured(number: int) -> None:
     play = scene(number)

@@ -262,6 +262,7 @@ def test_a_small_shear_sticks_and_comes_back() -> None:
     assert abs(back.wrench[0]) < 0.05 * abs(out.wrench[0])
 
 
+@pytest.mark.long
 def test_a_turn_twists_the_skin() -> None:
     motion = {"kind": "turn", "by_rad": 0.5, "from_s": 0.4, "to_s": 0.7}
     scene = sphere({"depth_m": 2e-4, "to_s": 1.1, "motions": [motion]}, 0.5)
@@ -283,6 +284,7 @@ def test_taps() -> None:
     assert depth[2] == pytest.approx(depth[0], rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_harder_press_within_a_touch() -> None:
     motion = {"kind": "press", "force_n": 1.5, "from_s": 0.5, "to_s": 0.8}
     scene = sphere({"force_n": 0.5, "to_s": 1.4, "motions": [motion]})

@@ -172,6 +172,7 @@ def test_frame_cleared_in_the_start_of_frame_does_not_delay_the_others() -> None
     assert [(event.station, event.started_ns) for event in delivered(bus)] == [(1, 0)]
 
 
+@pytest.mark.long
 def test_times_are_exact_after_many_frames() -> None:
     """Bits of 3 1/3 and 1/3 microseconds: a sum of rounded times would be off by milliseconds."""
     rates, rng = BitRates(300_000, 3_000_000), random.Random(5)

@@ -111,6 +111,7 @@ def test_error_flags_end_with_those_of_the_receivers(can_id: int, data: bytes, f
         assert 6 + 8 + 3 <= nominal - (bit + 1 - before) <= 12 + 8 + 3
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 0x7FF), st.binary(max_size=2), st.integers(0, 10**6) | st.integers(-16, -10))
 def test_passive_error_flag_is_noticed_as_missing_stuff_bits(can_id: int, data: bytes, bit: int) -> None:

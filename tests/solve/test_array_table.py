@@ -203,6 +203,7 @@ def test_the_order_of_a_declaration_changes_no_result(staggered: sk.PatchLayout)
     assert outcomes[0][0] > 10.0  # codes that are no measurement
 
 
+@pytest.mark.long
 def test_tables_of_two_orders_are_not_taken_for_each_other() -> None:
     other = reordered(SolveOptions)
     table = ArrayTable.__new__(other)

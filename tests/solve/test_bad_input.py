@@ -166,6 +166,7 @@ def test_a_touch_at_start_up(case: tuple[str, sk.Tracker], tared: bool) -> None:
         assert_truthful(tracker.update(noisy(pressed, rng)), np.zeros_like(moved) if tared else moved)
 
 
+@pytest.mark.long
 def test_constants_repeated_exactly(case: tuple[str, sk.Tracker]) -> None:
     """The same frame for ever: of the rest, of a press, and of equal numbers, which no skin gives."""
     layout, tracker = case

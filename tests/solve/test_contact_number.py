@@ -45,6 +45,7 @@ def deviations(field: sk.FieldFrame, load: Load, share: float) -> list[float]:
     return [abs(float(each)) for each in found]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 @pytest.mark.parametrize("family", some_long(FAMILIES, "sphere", "two spheres"))
 def test_each_body_is_one_contact_in_every_frame(staggered, family, method):
@@ -113,6 +114,7 @@ def test_exact_fields_have_hertzs_force_shear_and_centre(staggered):
     assert np.sqrt(np.mean(np.square(off))) < 0.15
 
 
+@pytest.mark.long
 def test_exact_fields_at_rest_have_no_contacts_and_no_forces(staggered):
     rng = np.random.default_rng(5)
     rest = Skin(staggered).rest_ohm

@@ -171,6 +171,7 @@ def test_a_deep_slide_is_not_taken_for_a_fault() -> None:
         assert field.faults == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("depth", [0.05, 0.1, 0.2, 0.3])
 def test_no_wire_is_named_under_a_dent_that_no_half_space_forms(depth: float) -> None:
     """Such a dent may make a frame doubtful, which then is not trusted; its wires are not at fault."""

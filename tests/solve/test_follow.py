@@ -23,6 +23,7 @@ def test_quantiles_of_chi_squared(probability):
 class TestFollow:
     """A wire that moved a little is solved with the inverse of an earlier frame."""
 
+    @pytest.mark.long
     def test_position_and_deviation_are_those_of_an_inverse_made_there(self, staggered):
         """The truth is NumPy's: the position that made the frame, and the inverse of J there."""
         tracker = ExactTracker(staggered, relative_noise=1e-5, hold=False)
@@ -102,6 +103,7 @@ class TestFollow:
 
 
 class TestHold:
+    @pytest.mark.long
     @pytest.mark.parametrize("depth", [0.0, 0.1])
     def test_an_unmoved_skin_is_held(self, staggered, depth):
         moved, rng = hertz_press(staggered, depth), np.random.default_rng(4)
@@ -151,6 +153,7 @@ class TestHold:
         assert np.mean(inside) > 0.93
         assert np.mean(inside, axis=(0, 2, 3)).min() > 0.88
 
+    @pytest.mark.long
     def test_press_and_release_ends_at_zero_within_noise(self, staggered, stream):
         tracker, rng = ExactTracker(staggered), np.random.default_rng(10)
         ends = []

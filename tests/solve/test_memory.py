@@ -44,6 +44,7 @@ def test_a_further_patch_of_a_layout_takes_little_memory(traced, method):
     assert len({id(tracker) for tracker in (first, *further)}) == FURTHER + 1  # all are still alive
 
 
+@pytest.mark.long
 def test_memory_follows_the_touch(traced):
     """A solve needs its arrays; a reset frees them, and so does the end of a search for wrong readings."""
     layout = sk.PatchLayout.preset("staggered")

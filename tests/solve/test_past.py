@@ -155,6 +155,7 @@ def test_a_reading_that_returns_is_taken_from_its_own_frames(small):
 # -- the posterior ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_held_press_gains_and_a_sudden_release_does_not_lag(small, pressed):
     rest, held = frame_ohm(small, np.zeros_like(pressed)), frame_ohm(small, pressed)
     own, without, inside, count = [], [], 0, 0

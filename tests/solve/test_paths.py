@@ -124,6 +124,7 @@ def test_a_layout_that_cannot_be_inverted_is_never_called_converged():
             assert path.status != (sk.Status.CONVERGED,), operator
 
 
+@pytest.mark.long
 def test_a_fold_that_the_skin_itself_passes_is_followed():
     """On thick layers a deep press turns the sign of det J of some wires; ten samples lead across."""
     layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=4e-3)

@@ -157,6 +157,7 @@ def test_deviations_shrink_with_the_noise(staggered):
     assert reported[1] < reported[0] / 20
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "lost", some_long(["a tenth", "half", "one wire", "three wires", "all but one wire"], "half", "one wire")
 )
@@ -254,6 +255,7 @@ SPOILT_WIRE = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", some_long(SPOILT_WIRE, next(iter(SPOILT_WIRE))))
 def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
     """It alone is not CONVERGED, its deviation is its neighbours' knowledge of it, and the next good frame is
@@ -610,6 +612,7 @@ def test_noise_of_one_frame_is_that_of_its_deviations(small):
     assert np.median(loose.displacement_std_m / fresh.displacement_std_m) == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.long
 def test_covariance_says_how_errors_hang_together(small):
     """Whitened by it, errors of 150 noisy frames of one press are of deviation 1 in all 75 directions, up
     to what the prior takes from the weakest of them."""

@@ -30,6 +30,7 @@ def skin_of(name: str = "staggered", height: float = 0.5, **sizes: int) -> Skin:
     return Skin(sk.PatchLayout.preset(name, pitch_m=4e-3, height_m=4e-3 * height, **sizes))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("skin", "noise"),
     [
@@ -79,6 +80,7 @@ def test_a_patch_noisier_than_stated_is_not_precise_once_its_noise_is_known() ->
     assert not tracker.update(noisy, relative_noise=1e-3).precise
 
 
+@pytest.mark.long
 def test_the_limits_that_the_user_sets_decide() -> None:
     skin = skin_of()
     for limit_m, precise in ((10e-6, True), (0.1e-6, False)):  # reached at this noise: 3 µm

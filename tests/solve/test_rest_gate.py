@@ -89,6 +89,7 @@ def test_the_deviations_at_rest_follow_the_noise_of_the_stream() -> None:
     assert std[1] > 3.0 * std[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [1e-5, 1e-3])
 def test_a_reading_that_goes_wrong_at_rest_is_found(noise: float) -> None:
     """As it is without the detector, which at a noise of 1e-3 names the whole wire."""

@@ -154,6 +154,7 @@ def test_lost_readings_neither_alarm_nor_hide_a_press() -> None:
     assert all(stream.see(np.where(np.arange(30) == 4, np.nan, sphere(0.03)), 10)[3:])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lost", some_long([True, False], True))
 def test_drift_while_no_scan_is_usable_is_no_touch(lost: bool) -> None:
     """For five minutes, scans are lost or without readings; the gains drift as much as the prior expects."""

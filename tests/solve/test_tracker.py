@@ -75,6 +75,7 @@ def test_a_stream_waits_for_no_table_after_preparation(monkeypatch):
         np.testing.assert_array_equal(plain.update(frame).displacement_m, field.displacement_m)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("depth", [0.0, 0.002])
 def test_slight_touches_in_codes_wait_for_no_table_either(monkeypatch, depth):
     """A reading is wrong by 0.2 %; explanations are sought at the smallest prior scales."""

@@ -202,6 +202,7 @@ def test_a_field_without_a_solved_wire_has_no_contacts() -> None:
     assert posterior.update(reading_ohm(press_m(0.3), rng, 1e-4)).contacts
 
 
+@pytest.mark.long
 def test_faults_of_the_exact_method_do_not_return_after_the_posterior() -> None:
     least, most, steps = 0.25, 1.25, 2**24 - 4
     step = (most - least) / steps

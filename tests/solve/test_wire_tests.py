@@ -56,6 +56,7 @@ def press(depth: float) -> Float:
     return contact.displacement_m(points).reshape(LAYOUT.upper_m.shape)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 @pytest.mark.parametrize("layer", some_long(["upper", "lower"], "upper"))
 def test_a_wire_whose_gain_changes_by_one_percent_is_named_at_once(layer: str, method: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from collections.abc import Callable
 from dataclasses import fields
 
 import numpy as np
@@ -30,7 +31,7 @@ def a_field() -> FieldFrame:
 
 
 @pytest.mark.parametrize("twin_of", [lambda each: pickle.loads(pickle.dumps(each)), copy.copy, copy.deepcopy])
-def test_a_copy_or_pickle_of_a_field_is_complete(twin_of) -> None:  # type: ignore[no-untyped-def]
+def test_a_copy_or_pickle_of_a_field_is_complete(twin_of: Callable[[FieldFrame], FieldFrame]) -> None:
     field = a_field()
     twin = twin_of(field)
     assert twin is not field

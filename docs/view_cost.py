@@ -1,6 +1,6 @@
 """Measure the cost of `skinnode view` for 16 patches on four CAN FD buses at 30 SYNCs per second.
 
-    python docs/view_cost.py [SECONDS [TOUCHED]]
+    python docs/view_cost.py [SECONDS [TOUCHED [ROUNDS]]]
 
 As in `skinnode bench pipeline`, a child process replays the frames of a hand over UDP. The first TOUCHED
 patches are pressed and stroked: 4 by default. The script alternates between runs without a view, runs with a
@@ -9,6 +9,9 @@ takes as much CPU time on the other core as the drawing and the data server, so 
 two kinds of run is due to the view rather than to a computer whose cores slow each other down. The host runs
 on one core; the generator, the drawing and the data server run on another. If permitted, the generator has
 real-time priority, because frames that it sends late would look like a slow host.
+
+A round is one run of each kind, 5 rounds by default. The end of the output gives the mean difference between
+the runs with and without the view over the rounds, with its 95 % confidence interval.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.special import stdtrit
 
 from skinnode.bench.load import LEAD_S, Generator
 from skinnode.bench.pipeline import FieldReader, full_hand, settle
@@ -38,7 +42,6 @@ from skinnode.view.drawing_thread import DrawingThread
 from skinnode.view.outputs import OutputOptions, open_output
 from skinnode.view.viewer_process import free_port
 
-ROUNDS: Final = 5
 PERIOD_MS: Final = 33
 KINDS: Final = ("without view", "with view", "beside another program")
 _OTHER: Final = """
@@ -138,6 +141,7 @@ def measure(
 def main() -> None:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     touched = int(sys.argv[2]) if len(sys.argv) > 2 else 4
+    rounds = int(sys.argv[3]) if len(sys.argv) > 3 else 5
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[:1])
     rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
@@ -152,7 +156,7 @@ def main() -> None:
             without_long_collections(),
         ):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-            for number in range(ROUNDS):
+            for number in range(rounds):
                 for kind in KINDS if number % 2 == 0 else (*KINDS[1::-1], KINDS[2]):
                     other = share(rows) if kind == KINDS[2] else 0.0
                     row = measure(hand, generator, cores[-1], seconds, viewed=kind == KINDS[1], other=other)
@@ -163,12 +167,25 @@ def main() -> None:
         medians = (statistics.median(row[name] for row in rows[kind]) for kind in KINDS)
         texts = [f"{value:.4g} {kind}" for value, kind in zip(medians, KINDS, strict=True)]
         print(f"median {name}:", ", ".join(texts))
+    for name in ("skipped", "p50", "p99"):
+        for kind in (KINDS[0], KINDS[2]):
+            print(f"{name} with view - {kind}: {difference(rows, name, kind)}")
 
 
 def share(rows: dict[str, list[dict[str, float]]]) -> float:
     """Return the median share of a core that the drawing and the data server took so far."""
     without, with_ = (statistics.median(row["children"] for row in rows[kind]) for kind in KINDS[:2])
     return max(0.01, with_ - without)
+
+
+def difference(rows: dict[str, list[dict[str, float]]], name: str, kind: str) -> str:
+    """Return the mean difference to the runs of a kind and its 95 % confidence interval (Student's t)."""
+    pairs = zip(rows[KINDS[1]], rows[kind], strict=True)
+    values = np.array([with_view[name] - other[name] for with_view, other in pairs])
+    if values.size < 2:
+        return f"{values.mean():.3g}"
+    half = stdtrit(values.size - 1, 0.975) * values.std(ddof=1) / np.sqrt(values.size)
+    return f"{values.mean():.3g} ({values.mean() - half:.3g} to {values.mean() + half:.3g})"
 
 
 if __name__ == "__main__":

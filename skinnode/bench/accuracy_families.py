@@ -22,7 +22,6 @@ from skinnode.bench.family_scenes import FAMILIES, Scene
 from skinnode.bench.truth import Converter, Skin
 from skinnode.model.frames import Z_95_TWO_SIDED, FieldFrame
 from skinnode.model.status import Status
-from skinnode.solve.options import PRIORS
 from skinnode.solve.posterior.posterior import Posterior
 
 LAYOUTS: Final = (("staggered", 0.5), ("aligned", 0.5), ("staggered", 1.0))
@@ -31,6 +30,7 @@ MOVED: Final = 0.1
 """Minimum displacement of a moved coordinate, relative to the largest displacement in its scene."""
 FAR: Final = 5.0
 """Error, in standard deviations, beyond which a scene counts as wrong."""
+PRIORS: Final = ("cells", "discs")
 RATIOS: Final = (0.85, 1.1)
 COVERAGES: Final = (0.92, 0.98)
 WRONG_MOST: Final = 0.01

@@ -11,7 +11,7 @@ from skinnode.config.table import Allowed, Stiffness, Table, one_of
 Method = Literal["auto", "exact", "posterior"]
 Operator = Literal["gauss_newton", "levenberg_marquardt", "dogleg"]
 Drift = Literal["none", "patch", "wire"]
-Prior = Literal["cells", "discs"]
+Prior = Literal["auto", "cells", "discs"]
 Past = Literal["off", "auto"]
 Partial = Literal["pass", "withhold"]
 
@@ -37,10 +37,11 @@ class SolverConfig(Table):
     drift: Annotated[Drift, one_of(Drift)] = "none"
     """Estimate the drift of the resistances together with the displacement: as one gain for the whole
     ``patch``, or one gain for each upper ``wire``. Requires the method ``posterior``."""
-    prior: Annotated[Prior, one_of(Prior)] = "cells"
+    prior: Annotated[Prior, one_of(Prior)] = "auto"
     """Loads that the method ``posterior`` expects in a touched patch: independent loads in single ``cells``,
-    or loads in a few soft ``discs``. At a noise of 1e-3, the errors with ``discs`` are about half as large,
-    and a scan takes 0.7 to 1.2 times as long. The method ``exact`` expects no loads and refuses ``discs``."""
+    or loads in a few soft ``discs``. ``auto`` selects ``discs`` if the noise is 1e-4 or more. At a noise of
+    1e-3, the errors with ``discs`` are about half as large, and a scan takes 0.7 to 1.2 times as long. The
+    method ``exact`` expects no loads and refuses ``discs``."""
     past: Annotated[Past, one_of(Past)] = "auto"
     """Use earlier scans: with ``auto``, the method ``posterior`` combines each scan with earlier scans if the
     noise is 1e-4 or more; with ``off``, every scan is solved on its own."""

@@ -94,10 +94,10 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
             f"at a noise of {noise:.0e}, the exact inverse has errors of ± {share:.0%} of the clearance, "
             'which are too large to be useful; method = "auto" uses the posterior',
         )
-    if noise >= DISCS_HELP and method == "posterior" and solver.prior != "discs":
+    if noise >= DISCS_HELP and method == "posterior" and solver.prior == "cells":
         yield (
             "solver.prior",
-            f'at a noise of {noise:.0e}, the errors are about twice those with prior = "discs"',
+            f'at a noise of {noise:.0e}, the errors are about twice those with prior = "auto"',
         )
     if method == "exact" and not patch.tolerances.build().exact:
         yield (

@@ -34,8 +34,8 @@ DEPTH: Final = 0.2
 """Maximum depth of the dent, as a fraction of the height of the electrodes."""
 RADIUS: Final = 1.5
 """Radius of the dent, in pitches."""
-KERNELS: Final = {"cells": ("solve_patch", "gauss_newton_step"), "discs": ("gauss_newton_step", "climb")}
-"""Kernels that must have been compiled before a time is measured, by prior."""
+KERNELS: Final = "solve_patch", "gauss_newton_step", "climb"
+"""Kernels that must have been compiled before a time is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def solve_rate(hand: HandConfig) -> SolveRate | None:
     Raises:
         ConfigError: if the solver cannot compute displacements for a patch's layout.
     """
-    if any(is_cold(kernel) for kernel in KERNELS[hand.solver.prior]):
+    if any(is_cold(kernel) for kernel in KERNELS):
         return None
     times: dict[str, float] = {}
     for patch in hand.patches:

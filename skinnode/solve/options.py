@@ -18,7 +18,7 @@ from skinnode.model.tolerances import Tolerances
 from skinnode.solve.inputs import CodeMap
 
 TRACKER_METHODS: Final = ("auto", "exact", "posterior")
-PRIORS: Final = ("cells", "discs")
+PRIORS: Final = ("auto", "cells", "discs")
 PASTS: Final = ("off", "auto")
 DRIFTS: Final = ("none", "patch", "wire")
 
@@ -60,7 +60,8 @@ class EstimateOptions:
         prior: Prior for the loads after the posterior has found a touch: ``cells`` for one variance per cell,
             or ``discs`` for a few soft discs, which are fitted to the frame by maximising the evidence. With
             ``discs``, errors are smaller, but with ``model_error`` the standard deviations are too small. If
-            the loads are not local, ``discs`` falls back to ``cells``.
+            the loads are not local, ``discs`` falls back to ``cells``. ``auto`` selects ``discs`` if the
+            noise of the readings is 1e-4 or more and neither ``model_error`` nor ``scale_m`` is given.
         past: ``auto`` if the posterior is to use earlier frames as well when the noise of the readings is
             1e-4 or more; ``off`` if it is to solve each frame alone. A sudden change in the loads takes
             effect in the same frame. Ignored if ``estimate_noise`` is set, and for patches with fewer than 12
@@ -84,7 +85,7 @@ class EstimateOptions:
     normal_only: bool = False
     hold: bool = True
     deadline_us: float | None = None
-    prior: str = "cells"
+    prior: str = "auto"
     past: str = "auto"
 
     def __post_init__(self) -> None:

@@ -272,8 +272,9 @@ def test_a_layout_that_the_host_would_refuse(tmp_path: Path) -> None:
 
 def test_discs_are_recommended_where_they_help(tmp_path: Path) -> None:
     noisy = "relative_noise = 1e-3\n"
-    assert 'prior = "discs"' in said(notes(tmp_path, PALM + noisy + TIP), "solver.prior")["palm"]
-    assert not said(notes(tmp_path, '[solver]\nprior = "discs"\n' + PALM + noisy), "solver.prior")
+    cells = '[solver]\nprior = "cells"\n'
+    assert 'prior = "auto"' in said(notes(tmp_path, cells + PALM + noisy + TIP), "solver.prior")["palm"]
+    assert not said(notes(tmp_path, PALM + noisy), "solver.prior")
 
 
 @pytest.mark.long

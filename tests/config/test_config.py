@@ -129,7 +129,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             "solver.false_alarms_per_hour: got 0, allowed: a number from 1e-6 to 1e4 (1/h)",
         ),
         (["solver", "past"], "on", "solver.past: got 'on', allowed: off or auto"),
-        (["solver", "prior"], "auto", "solver.prior: got 'auto', allowed: cells or discs"),
+        (["solver", "prior"], "local", "solver.prior: got 'local', allowed: auto or cells or discs"),
         (
             ["patches", 1, "row_time_us"],
             -1,

@@ -16,6 +16,8 @@ from skinnode.solve.posterior.local import discs
 from skinnode.solve.posterior.local.discs import LOADS, Effects
 from tests.lanes import some_long
 
+from .press import frame_ohm, hertz_press
+
 PLACE = np.indices((3, 4)).reshape(2, -1).T.astype(np.float64)
 DISCS = np.array([[1.0, 1.5, np.log(2.0), -0.4, -0.5], [0.5, 3.0, np.log(2.5), 0.3, 0.2]])
 
@@ -304,5 +306,25 @@ def test_discs_are_found_while_a_press_grows_whose_first_frames_did_not_show_the
 
 
 def test_an_unknown_prior_is_refused(skin):
-    with pytest.raises(ValueError, match="prior: got 'disc', must be one of cells, discs"):
+    with pytest.raises(ValueError, match="prior: got 'disc', must be one of auto, cells, discs"):
         sk.Posterior(skin.layout, prior="disc")
+
+
+def test_auto_selects_discs_where_they_reduce_the_error(staggered: sk.PatchLayout) -> None:
+    """At a noise of 1e-4, unless an option that the discs do not support is given."""
+    rng = np.random.default_rng(3)
+    moved = hertz_press(staggered, 0.2)
+    exact = frame_ohm(staggered, moved)
+    for noise, options, expected in (
+        (1e-5, {}, "cells"),
+        (1e-4, {}, "discs"),
+        (1e-4, {"model_error": 0.01}, "cells"),
+        (1e-4, {"scale_m": 1e-4}, "cells"),
+    ):
+        frame = exact * (1.0 + noise * rng.standard_normal(exact.shape))
+        found, same = (
+            sk.Posterior(staggered, relative_noise=noise, **options, **more).update(frame)
+            for more in ({}, {"prior": expected})
+        )
+        np.testing.assert_array_equal(found.displacement_m, same.displacement_m)
+        np.testing.assert_array_equal(found.displacement_std_m, same.displacement_std_m)

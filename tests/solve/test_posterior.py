@@ -106,7 +106,7 @@ def test_reported_deviations_and_intervals_hold(name, sigma, least, kind):
     """A jump from rest to each of 10 scenes is solved: 95 % in the interval, no error beyond 5 deviations."""
     layout = sk.PatchLayout.preset(name)
     rng = np.random.default_rng(8)
-    tracker = sk.Posterior(layout, relative_noise=sigma)
+    tracker = sk.Posterior(layout, relative_noise=sigma, prior="cells")
     inside, error2, reported2 = [], [], []
     for depth in rng.uniform(0.05, 0.4, 10):
         moved = sphere(layout, rng, depth) if kind == "sphere" else dent(layout, rng, depth, kind)
@@ -149,7 +149,8 @@ def test_deviations_shrink_with_the_noise(staggered):
     exact = frame_ohm(staggered, moved)
     errors, reported = [], []
     for sigma in (1e-4, 1e-6):
-        field = sk.Posterior(staggered, relative_noise=sigma).update(noisy(exact, rng, sigma))
+        posterior = sk.Posterior(staggered, relative_noise=sigma, prior="cells")
+        field = posterior.update(noisy(exact, rng, sigma))
         assert field.trusted
         errors.append(np.sqrt(np.mean((field.displacement_m - moved) ** 2)))
         reported.append(np.sqrt(np.mean(field.displacement_std_m**2)))
@@ -579,7 +580,7 @@ def test_covariance_belongs_to_the_field(small):
     in the middle, on a symmetry line of the layout, whatever the noise."""
     rng = np.random.default_rng(17)
     for sigma, loose in ((1e-6, 1.2), (1e-4, np.inf)):
-        tracker = sk.Posterior(small, relative_noise=sigma, hold=False)
+        tracker = sk.Posterior(small, relative_noise=sigma, hold=False, prior="cells")
         field = tracker.update(
             noisy(frame_ohm(small, hertz_press(small, 0.1, centre_m=(8e-3, 8e-3))), rng, sigma)
         )
@@ -607,7 +608,7 @@ def test_noise_of_one_frame_is_that_of_its_deviations(small):
     tracker = sk.Posterior(small, relative_noise=SIGMA, hold=False)
     sharp = tracker.update(frame)
     loose = tracker.update(frame, relative_noise=100 * SIGMA)
-    fresh = sk.Posterior(small, relative_noise=100 * SIGMA, hold=False).update(frame)
+    fresh = sk.Posterior(small, relative_noise=100 * SIGMA, hold=False, prior="cells").update(frame)
     assert np.median(loose.displacement_std_m / sharp.displacement_std_m) > 3
     assert np.median(loose.displacement_std_m / fresh.displacement_std_m) == pytest.approx(1.0, abs=0.3)
 

@@ -5,9 +5,13 @@ of the load sum. The cells are visited in order of decreasing load sum, and each
 neighbouring peak. Where two areas meet, their peaks stay separate contacts only if the load sum between them
 is much smaller than at both peaks, and the difference is significant (topological persistence).
 
+If the loads are expected in discs that form several groups, and the skin rises between the groups, the cells
+of each group are an area from the beginning: the load sums of bodies close to each other have a single peak.
+
 A peak is a contact if its load sum, the χ² of the loads of the same cells, or the sum of the loads over its
 area is significant. The strongest peak is also a contact if the skin there is significantly indented. Such an
-indentation indicates a touch even if the loads cannot be located.
+indentation indicates a touch even if the loads cannot be located. A group of discs is a contact if it
+increases the evidence of the frame.
 
 Only cells with an electrode are tested. The loads on cells beyond the outermost electrodes are ambiguous,
 because a small load nearby and a large load farther away cause nearly the same displacement. Cells beyond the
@@ -64,6 +68,14 @@ GAP_ONE: Final = 0.4
 """Value of :data:`GAP` for two peaks that belonged to the same contact in the last frame."""
 GAP_TWO: Final = 0.6
 """Value of :data:`GAP` for two peaks that belonged to different contacts in the last frame."""
+LEVEL: Final = 0.8
+"""Maximum depth of the skin between two contacts, relative to the smaller depth at their peaks. Between two
+bodies, the skin rises; under a plate, whose loads are largest at its border, it does not."""
+RELEVANT_GROUP: Final = 0.05
+"""Value of :data:`RELEVANT` for a contact in a group of discs of its own. The evidence for the group shows
+that its loads are not an error of the loads nearby."""
+EVIDENT: Final = 12.0
+"""Gain in log evidence due to a group of discs, in nats, above which the group is a contact."""
 GAP_SIGNIFICANT: Final = 3.0
 """Minimum difference between the load sum at the smaller of two peaks and the load sum between the peaks, in
 standard deviations, for the peaks to be separate contacts."""
@@ -163,6 +175,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     other: int,
     between: int,
     total: Float,
+    depth_m: Float,
     before: Index,
     near: Index,
     own: NDArray[np.bool_],
@@ -180,6 +193,8 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     gap = GAP
     if before[peak] > 0 and before[other] > 0:
         gap = GAP_ONE if before[peak] == before[other] else GAP_TWO
+    if depth_m[between] > LEVEL * min(depth_m[peak], depth_m[other]):
+        return False
     fall = total[other] - total[between]
     if not total[between] < gap * total[other]:
         return False
@@ -229,6 +244,9 @@ def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and s
     electrodes: int,
     order: Index,
     total: Float,
+    press: Float,
+    depth_m: Float,
+    group: Index,
     before: Index,
     near: Index,
     own: NDArray[np.bool_],
@@ -247,9 +265,20 @@ def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and s
     cells, top = total.size, total[order[0]]
     for cell in range(cells):
         area[cell], parent[cell] = -1, cell
+    for k in range(electrodes):  # each group of discs is the area of its largest load
+        cell = order[k]
+        if group[cell] > 0:
+            peak = cell
+            for j in range(electrodes):
+                other = order[j]
+                if group[other] == group[cell] and press[other] > press[peak]:
+                    peak = other
+            area[cell] = peak
     for k in range(electrodes):
         cell = order[k]
-        if total[cell] <= PART * RELEVANT_STILL * top:
+        if group[cell] > 0:
+            continue
+        if total[cell] <= PART * RELEVANT_GROUP * top:
             break
         for other in range(cells):
             split[cell, other] = False
@@ -278,7 +307,10 @@ def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and s
             other = around[c]
             if other == best or split[best, other]:
                 continue
-            if _apart(best, other, cell, total, before, near, own, rows, weight, share, scale2, few, signs):
+            known = group[best] > 0 and group[other] > 0
+            if known or _apart(
+                best, other, cell, total, depth_m, before, near, own, rows, weight, share, scale2, few, signs
+            ):
                 split[best, other] = True
             else:
                 parent[other] = best
@@ -295,6 +327,8 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
     total: Float,
     press: Float,
     depth: Float,
+    group: Index,
+    gain: Float,
     before: Index,
     near: Index,
     own: NDArray[np.bool_],
@@ -318,7 +352,8 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
         if area[peak] != peak:
             continue
         still = before[peak] > 0
-        if found > 0 and total[peak] < (RELEVANT_STILL if still else RELEVANT) * strongest:
+        relevant = RELEVANT_GROUP if group[peak] > 0 else RELEVANT_STILL if still else RELEVANT
+        if found > 0 and total[peak] < relevant * strongest:
             continue
         count, box = _box(peak, near, own, few), 0.0
         for c in range(count):
@@ -332,8 +367,11 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
                 size += 1
                 deep = max(deep, depth[cell])
                 load += press[cell]
+        if size == 0:  # the loads around the peak do not press
+            continue
         least = SIGNIFICANT_STILL if still else SIGNIFICANT
-        real = found == 0 and peak == order[0] and deep > (PRESSED_STILL if still else PRESSED)
+        alone = group[peak] > 0 or (found == 0 and peak == order[0])
+        real = alone and (gain[group[peak]] > EVIDENT or deep > (PRESSED_STILL if still else PRESSED))
         if not real:
             real = box > 0.0 and box * box > least * least * variance
             if not real and press[peak] > 0.0:
@@ -354,6 +392,9 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
 def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice and outputs by name
     press: Float,
     depth: Float,
+    depth_m: Float,
+    group: Index,
+    gain: Float,
     rows: Float,
     weight: Float,
     share: Float,
@@ -370,6 +411,9 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
     Args:
         press: (Q,) pressing loads.
         depth: (Q,) depth of the skin at the electrode of each cell, in standard deviations.
+        depth_m: (Q,) the same in metres.
+        group: (Q,) number of the group of discs that contains each cell; 0 for other cells.
+        gain: (G + 1,) gain in log evidence due to each group, in nats; the first value is the largest gain.
         rows: (m, 3Q) rows of the information about the loads.
         weight: (m,) weight of each row (:class:`skinnode.solve.posterior.contacts.LoadEstimate`).
         share: (Q,) prior variances of the loads, relative to ``scale2``.
@@ -389,12 +433,12 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
     if not total[order[0]] > 0.0:
         return 0
     _grow_areas(
-        electrodes, order, total, before, near, own, rows, weight, share, scale2, parent, area, around,
-        few, signs, split,
+        electrodes, order, total, press, depth_m, group, before, near, own, rows, weight, share, scale2,
+        parent, area, around, few, signs, split,
     )  # fmt: skip
     found = _number_contacts(
-        electrodes, order, total, press, depth, before, near, own, rows, weight, share, scale2, area,
-        patch, few, ones, block_cov, block, number,
+        electrodes, order, total, press, depth, group, gain, before, near, own, rows, weight, share, scale2,
+        area, patch, few, ones, block_cov, block, number,
     )  # fmt: skip
     if found > 0:
         _dilate(total, near, number, outside, patch)

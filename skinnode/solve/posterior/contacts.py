@@ -11,6 +11,7 @@ centre, area and shear of each contact, with standard deviations.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.layer_force import bonded_force_n, layer_std_n
 from skinnode.solve.linalg.vectors import Index
-from skinnode.solve.posterior.contact_regions import find_regions, region_scratch
+from skinnode.solve.posterior.contact_regions import LEVEL, find_regions, region_scratch
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.load_prior import PRIOR_DOUBT
 
@@ -112,6 +113,7 @@ class ContactFinder:
         self._has_electrode[self._own] = True
         self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
         self._depth_m, self._depth = np.zeros((2, cells))
+        self._none = np.zeros(cells, np.int64)
         self._press = np.zeros(cells)
         self._field = np.zeros((2, len(self._own), 3))  # displacement and its standard deviations, in m
         self._scratch = region_scratch(cells)
@@ -122,7 +124,12 @@ class ContactFinder:
         self._number[:] = 0
 
     def find(
-        self, loads: LoadEstimate, displacement_m: Float, std_m: Float
+        self,
+        loads: LoadEstimate,
+        displacement_m: Float,
+        std_m: Float,
+        groups: Index | None = None,
+        gain: Float | None = None,
     ) -> tuple[Float, tuple[Contact, ...]]:
         """Return the forces on the electrodes' cells, and the contacts.
 
@@ -130,6 +137,10 @@ class ContactFinder:
             loads: Loads estimated from the frame.
             displacement_m: (U, N, 3) displacement, in m.
             std_m: (U, N, 3) standard deviation of the displacement, in m; inf for unsolved electrodes.
+            groups: (Q,) number of the group of discs that contains each cell; 0 for other cells. Each group
+                may be a contact. Default: all 0.
+            gain: (G + 1,) gain in log evidence due to each group, in nats; the first value is the largest
+                gain. Default: 0.
 
         Returns:
             (U, N, 3) forces on the electrodes' cells, in N, and the contacts in order of decreasing normal
@@ -143,9 +154,12 @@ class ContactFinder:
             self._depth_m, self._depth, force.reshape(-1, 3),
         )  # fmt: skip
         self._before[:] = self._number
+        group, gain = self._none if groups is None else groups, np.zeros(1) if gain is None else gain
+        if group.any():
+            group, gain = self._apart(group, gain)
         count = find_regions(
-            self._press, self._depth, loads.rows, loads.weight, loads.share, loads.scale2,
-            self._has_electrode, self._near, self._before, self._number, self._outside,
+            self._press, self._depth, self._depth_m, group, gain, loads.rows, loads.weight, loads.share,
+            loads.scale2, self._has_electrode, self._near, self._before, self._number, self._outside,
             self._scratch,
         )  # fmt: skip
         if loads.add_shear is not None:
@@ -153,6 +167,33 @@ class ContactFinder:
         found = [self._contact(number, loads) for number in range(1, count + 1)]
         found.sort(key=lambda contact: -contact.normal_force_n)
         return force, tuple(found)
+
+    def _apart(self, groups: Index, gain: Float) -> tuple[Index, Float]:
+        """Merge those groups of discs between which the skin does not rise.
+
+        Args:
+            groups: (Q,) number of the group that contains each cell; 0 for other cells.
+            gain: (G + 1,) gain due to each group; the first value is the largest gain.
+
+        Returns:
+            The groups and their gains; the gain for cells in no group is 0. If only one group remains, all
+            cells are in no group, and the first gain is unchanged.
+        """
+        groups, gain = np.where(self._has_electrode, groups, 0), gain.copy()
+        numbers = np.unique(groups[groups > 0])
+        peaks = [int(np.argmax(np.where(groups == number, self._depth_m, -np.inf))) for number in numbers]
+        for i, j in itertools.combinations(range(len(numbers)), 2):
+            ends = np.array([np.unravel_index(peaks[k], self._prior.shape) for k in (i, j)])
+            line = np.rint(np.linspace(*ends, 2 * int(np.abs(ends[1] - ends[0]).max()) + 1)).astype(np.int64)
+            depth_m = self._depth_m[np.ravel_multi_index(tuple(line.T), self._prior.shape)]
+            known_m = depth_m[depth_m != 0.0]  # 0: unsolved
+            if known_m.min(initial=np.inf) > LEVEL * min(depth_m[0], depth_m[-1]):
+                gain[numbers[i]] = max(gain[numbers[[i, j]]])
+                groups[groups == numbers[j]] = numbers[j] = numbers[i]
+        if len(np.unique(numbers)) < 2:
+            return self._none, gain
+        gain[0] = 0.0
+        return groups, gain
 
     def warm_up(self, loads: LoadEstimate) -> None:
         """Compile the kernels."""

@@ -43,6 +43,9 @@ from skinnode.solve.posterior.observation import Observation, ObservationModel, 
 from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
+DISCS_FROM: Final = 0.9e-4
+"""Noise of the readings from which the prior ``auto`` consists of discs; slightly less than 1e-4. At 1e-4,
+discs reduce the median error by a quarter to a third; at 1e-3, by half (docs/methods.md)."""
 NOISE_LEAST: Final = 1e-6
 """Minimum relative noise assumed in a solve; also accounts for errors in the forward model. With less noise,
 every solve would end at a root of F = b, which can be the wrong root. On layouts with folds (det J = 0),
@@ -59,6 +62,13 @@ Mask = NDArray[np.bool_]
 
 _WARM: Final[weakref.WeakKeyDictionary[PatchLayout, set[tuple[object, ...]]]] = weakref.WeakKeyDictionary()
 """Options for which the kernels have been compiled, by layout."""
+
+
+def expects_discs(options: PosteriorOptions, noise: float) -> bool:
+    """Return whether a posterior with these options expects the loads in discs, given its relative noise."""
+    if options.prior == "auto":
+        return noise >= DISCS_FROM and options.model_error == 0.0 and options.scale_m is None
+    return options.prior == "discs"
 
 
 class FrameEstimator:
@@ -120,7 +130,7 @@ class FrameEstimator:
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
         discs = None
-        if options.prior == "discs":
+        if expects_discs(options, float(np.median(self._noise))):
             every = (np.arange(wires)[:, None] * layout.unknowns + self._free).ravel()
             layer = np.ascontiguousarray(bonded_response(layout)[every] / LAYER_SHARE)
             discs = DiscPrior(self._estimator, elastic.shape, height, layer)
@@ -138,7 +148,7 @@ class FrameEstimator:
         deadline is set, this method also measures :attr:`from_rest_s`.
         """
         warm = _WARM.setdefault(self.layout, set())
-        kernels = self.options.kernels
+        kernels = *self.options.kernels, self._hyper.discs is None
         if kernels in warm and self._seconds == math.inf:
             return
         touched = self.layout.upper_m.copy()
@@ -509,7 +519,10 @@ class FrameEstimator:
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():
             self._force, self._contacts_found = self._contacts.find(
-                self._hyper.loads.estimate(), displacement, (std * pitch).reshape(displacement.shape)
+                self._hyper.loads.estimate(),
+                displacement,
+                (std * pitch).reshape(displacement.shape),
+                *self._hyper.groups(),
             )
         std[:, self._free] = self._hyper.with_undetected(std[:, self._free])
         if not held.all():

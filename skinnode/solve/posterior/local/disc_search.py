@@ -1,11 +1,12 @@
 """Fits soft load discs to a frame.
 
 The data are linearised at the current displacement, and whitened with the covariance expected for untouched
-skin, where all loads are equally small. The first disc is placed where a load, on a half- space or on a thin
+skin, where all loads are equally small. The first disc is placed where a load, on a half-space or on a thin
 bonded layer, matches the whitened data best, and is then fitted
 (:mod:`skinnode.solve.posterior.local.discs`). Further discs are added where a load matches the remaining data
-best, as long as the gain in evidence outweighs the additional parameters. In a stream, the search starts from
-the discs of the last frame.
+best, as long as the gain in evidence outweighs the additional parameters. A wide disc is replaced by two
+smaller ones if these explain the data better. In a stream, the search starts from the discs of the last
+frame.
 
 No disc is used if equal loads over the whole patch explain the frame better than the discs, or if the loads
 require many or large discs.
@@ -66,6 +67,21 @@ more than this, it is recomputed with all discs refitted."""
 NOTICED: Final = 8.0
 """Minimum squared match between a load and the remaining data at which another disc is tried, in noise
 variances."""
+SPLIT_RADIUS: Final = 0.7
+"""Disc radius above which the search tries to replace the disc by two, in cells. If there are two bodies, the
+first disc usually lies between them and covers both."""
+SPLIT_RADII: Final = (0.4, 0.8)
+"""Radii of the two discs at which this search starts, in cells."""
+SPLIT_AMPLITUDES: Final = (0.4, 0.8, 1.2)
+"""Their values of ln a, relative to that of the wide disc."""
+SPLIT_LEAST: Final = 0.8
+"""Minimum initial distance of the two discs from the centre of the loads of the wide disc, in cells."""
+GROUP_LEAST: Final = 0.05
+"""Minimum load variance of a disc in a group, summed over the disc's area, relative to the strongest disc."""
+GROUP_GAP: Final = 1.0
+"""Maximum gap between the discs of a group, in cells."""
+GROUP_REACH: Final = 1.5
+"""Maximum distance of a cell from the rim of its disc, in cells."""
 NEAR: Final = 1.0
 """Radius of the discs that are matched to the data to find a starting point, in cells."""
 
@@ -114,12 +130,34 @@ class DiscPrior:
             [near[self._inside] @ self.response_t[2::LOADS], self.response_t[3::LOADS][self._inside]]
         )  # responses to the loads that are matched to the data
         self.discs: Float = np.empty((0, PARAMETERS))
+        self._group: Index = np.empty(0, np.int64)  # number of the group of each disc; 0 if it is in none
+        self._gain = np.empty(0)  # gain in log evidence due to each group, in nats
         self.spread = np.zeros(len(self._prior.response))
 
     def reset(self) -> None:
         """Discard the discs."""
-        self.discs = np.empty((0, PARAMETERS))
+        self.discs, self._gain = np.empty((0, PARAMETERS)), np.empty(0)
         self.spread[:] = 0.0
+
+    def groups(self) -> tuple[Index, Float]:
+        """Return the groups of discs, each of which may be a contact.
+
+        Returns:
+            (Q,) number of the group that contains each cell; 0 for other cells, and for all cells if there is
+            only one disc. (G + 1,) gain in log evidence due to each group, in nats; the first value is the
+            largest gain.
+        """
+        found = np.zeros(len(self._place), np.int64)
+        if not len(self._gain):
+            return found, np.zeros(1)
+        gain = np.concatenate([[self._gain.max()], self._gain])
+        if len(self._gain) > 1:
+            beyond = np.linalg.norm(self._place[:, None] - self.discs[:, :2], axis=-1) - np.exp(
+                self.discs[:, 2]
+            )
+            beyond[:, self._group == 0] = np.inf
+            found = np.where(beyond.min(axis=1) < GROUP_REACH, self._group[beyond.argmin(axis=1)], 0)
+        return found, gain
 
     def fit(
         self,
@@ -165,11 +203,16 @@ class DiscPrior:
                 rejected = more, excess
                 break
             discs = more
+            if len(discs) > 1 and _all_wide(discs):
+                break
+        if own + search.evidence >= least:
+            discs = search.with_wide_discs_split(discs)
         wide = len(discs) == MOST or bool((discs[:, 2] > math.log(WIDE)).any())
         if own + search.evidence < least or not len(discs) or wide:
             self.reset()
             return None
         self.discs = discs
+        self._group, self._gain = search.grouped(discs)
         self.spread[:] = 0.0
         if not first:
             search.measure_spread(discs)
@@ -178,6 +221,11 @@ class DiscPrior:
         variance = np.empty((2, len(self._place)))
         kernels.add_variance(discs, self._place, variance)
         return variance
+
+
+def _all_wide(discs: Float) -> bool:
+    """Return whether every disc is too wide to be used, so that a further search would be futile."""
+    return bool((discs[:, 2] > math.log(WIDE)).all())
 
 
 class _Search:
@@ -247,12 +295,60 @@ class _Search:
         else:
             more, gain = self._climb(first, effects)
             found = np.vstack([discs, more])
-            if gain > PAYS + math.log(PARAMETERS * len(found)) - YIELDS:
+            if gain > PAYS + math.log(PARAMETERS * len(found)) - YIELDS and not _all_wide(found):
                 found = self._fitted(found)
                 gain = self.evidence - before
         if not gain > PAYS + math.log(PARAMETERS * len(found)):
             self.evidence = before
         return found, gain
+
+    def with_wide_discs_split(self, discs: Float) -> Float:
+        """Return ``discs``, each wide one replaced by two smaller ones if this is worthwhile."""
+        for disc in discs[discs[:, 2] > math.log(SPLIT_RADIUS)] if len(discs) < MOST - 1 else ():
+            d = int(np.argmax((discs == disc).all(axis=1)))
+            found = self._split(discs, d) if (discs[d] == disc).all() and len(discs) < MOST - 1 else None
+            discs = discs if found is None else found
+        return discs
+
+    def _split(self, discs: Float, d: int) -> Float | None:
+        """Return the discs with disc ``d`` replaced by two; None if this is not worthwhile.
+
+        The two discs start on the main axis of the mean loads in the wide disc.
+        """
+        p, loads, wide, others = self._p, self._loads, discs[d], np.delete(discs, d, axis=0)
+        square = (loads.mean(discs, p._scratch)[0].reshape(-1, LOADS) ** 2).sum(axis=1)
+        place = loads.effects.place
+        square[((place - wide[:2]) ** 2).sum(axis=1) > (math.exp(wide[2]) + EDGE) ** 2] = 0.0
+        if not square.any():
+            return None
+        centre = square @ place / square.sum()
+        spread = (place - centre).T @ (square[:, None] * (place - centre)) / square.sum()
+        values, axes = np.linalg.eigh(spread)
+        away = max(math.sqrt(values[1]), SPLIT_LEAST) * axes[:, 1]
+        places = np.clip([centre - away, centre + away], p._bounds[0, :2], p._bounds[1, :2])
+        effects, before, alone = loads.effects, self.evidence, self.evidence
+        if len(others):
+            own = loads.near(wide[None, :2], np.exp(wide[None, 2]) + REACH)
+            effects = loads.given(others, own, p._scratch)
+            alone = kernels.evidence(wide[None], effects, p._scratch)
+            alone += kernels.log_prior(wide[None], p._amplitude)
+        trials = [
+            np.column_stack([places, np.tile([math.log(radius), wide[3] + more, wide[4]], (2, 1))])
+            for radius in SPLIT_RADII
+            for more in SPLIT_AMPLITUDES
+        ]
+        for trial in trials:
+            trial[:, 3] = np.minimum(trial[:, 3], p._bounds[1, 3])
+        pair, found = self._climb(
+            max(trials, key=lambda t: kernels.evidence(t, effects, p._scratch)), effects
+        )
+        least = PAYS + math.log(PARAMETERS * (len(discs) + 1))
+        if found - alone > least - YIELDS:
+            result = self._fitted(np.vstack([others, pair]))
+            if self.evidence - before > least:
+                return result
+        self.evidence = before
+        return None
 
     def _set_unit(self, place: Float) -> None:
         """Compute the noise variance of the match for loads like those at ``place``."""
@@ -300,6 +396,28 @@ class _Search:
         work = np.empty((3, *found.shape))
         evidence = kernels.climb(found, effects, p._amplitude, p._bounds, work, p._scratch)
         return found, evidence
+
+    def grouped(self, discs: Float) -> tuple[Index, Float]:
+        """Return each disc's group number (D,), and the gain (G,) in log evidence due to each group, in nats.
+
+        Discs that nearly touch form a group. Discs that are much weaker than the strongest are in group 0.
+        """
+        p, loads, radius = self._p, self._loads, np.exp(discs[:, 2])
+        power = np.exp(2.0 * (discs[:, 2] + discs[:, 3]))
+        strong = power > GROUP_LEAST * power.max()
+        gap = np.linalg.norm(discs[:, None, :2] - discs[:, :2], axis=-1)
+        near = (gap < radius[:, None] + radius + GROUP_GAP) & strong & strong[:, None]
+        for _ in discs:
+            near = near @ near
+        first = near.argmax(axis=1)  # first disc of each disc's group
+        numbers = np.unique(first[strong])
+        group = np.where(strong, np.searchsorted(numbers, first) + 1, 0)
+        gain = np.empty(len(numbers))
+        for number in range(len(numbers)):
+            rest = discs[group != number + 1]
+            left = kernels.evidence(rest, loads.effects, p._scratch) + kernels.log_prior(rest, p._amplitude)
+            gain[number] = self.evidence - left
+        return group, gain
 
     def add_spread_of_rejected(self, discs: Float, more: Float, excess: float) -> None:
         """Add the variance due to a rejected disc that may nevertheless exist."""

@@ -183,8 +183,9 @@ class ContactFinder:
         numbers = np.unique(groups[groups > 0])
         peaks = [int(np.argmax(np.where(groups == number, self._depth_m, -np.inf))) for number in numbers]
         for i, j in itertools.combinations(range(len(numbers)), 2):
-            ends = np.array([np.unravel_index(peaks[k], self._prior.shape) for k in (i, j)])
-            line = np.rint(np.linspace(*ends, 2 * int(np.abs(ends[1] - ends[0]).max()) + 1)).astype(np.int64)
+            first, last = (np.array(np.unravel_index(peaks[k], self._prior.shape)) for k in (i, j))
+            steps = 2 * int(np.abs(last - first).max())
+            line = np.rint(np.linspace(first, last, steps + 1)).astype(np.int64)
             depth_m = self._depth_m[np.ravel_multi_index(tuple(line.T), self._prior.shape)]
             known_m = depth_m[depth_m != 0.0]  # 0: unsolved
             if known_m.min(initial=np.inf) > LEVEL * min(depth_m[0], depth_m[-1]):

@@ -304,10 +304,11 @@ class _Search:
 
     def with_wide_discs_split(self, discs: Float) -> Float:
         """Return ``discs``, each wide one replaced by two smaller ones if this is worthwhile."""
-        for disc in discs[discs[:, 2] > math.log(SPLIT_RADIUS)] if len(discs) < MOST - 1 else ():
-            d = int(np.argmax((discs == disc).all(axis=1)))
-            found = self._split(discs, d) if (discs[d] == disc).all() and len(discs) < MOST - 1 else None
-            discs = discs if found is None else found
+        for disc in discs[discs[:, 2] > math.log(SPLIT_RADIUS)]:
+            same = (discs == disc).all(axis=1)  # none after a split that changed this disc, too
+            if len(discs) < MOST - 1 and same.any():
+                found = self._split(discs, int(np.argmax(same)))
+                discs = discs if found is None else found
         return discs
 
     def _split(self, discs: Float, d: int) -> Float | None:

@@ -159,6 +159,7 @@ class FrameEstimator:
         self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
         self._estimator.gamma()  # compile the kernel
+        self._hyper.loads.expected(1.0)  # with discs, used only if the loads are not local
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads.estimate())
         self._forget()

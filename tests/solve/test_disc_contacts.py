@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -92,3 +94,25 @@ def test_skin_that_is_pulled_beside_a_press_is_no_contact(staggered: sk.PatchLay
     field = sk.Posterior(staggered, relative_noise=noise).update(noisy_ohm(staggered, moved, noise, rng))
     (contact,) = field.contacts
     np.testing.assert_allclose(contact.centroid_m[:2] / PITCH_M, (2.5, 2.5), atol=0.6)
+
+
+def test_groups_of_discs_whose_loads_only_pull_are_no_contacts(staggered: sk.PatchLayout) -> None:
+    """Their evidence is clear, but no cell around them presses."""
+    posterior = sk.Posterior(staggered, relative_noise=1e-3)
+    posterior.update(frame_ohm(staggered, press(staggered, (4.0, 4.0), 0.2)))
+    finder, loads = posterior._contacts, posterior._hyper.loads.estimate()
+    mean = np.zeros_like(loads.mean)
+    groups = np.zeros(len(mean), np.int64)
+    moved = np.full(staggered.upper_m.shape, -1e-6)
+    own = finder._own.reshape(moved.shape[:2])
+    for number, place in ((1, (2, 2)), (2, (7, 7))):
+        groups[own[place]], mean[own[place], 2], moved[place] = number, 1e-3, -1e-4
+    mean[own[4, 5], 2] = -1e-9
+    _, contacts = finder.find(
+        dataclasses.replace(loads, mean=mean),
+        moved,
+        np.ones_like(moved),
+        groups,
+        np.array([50.0, 50.0, 50.0]),
+    )
+    assert contacts == ()

@@ -70,12 +70,13 @@ GAP_TWO: Final = 0.6
 """Value of :data:`GAP` for two peaks that belonged to different contacts in the last frame."""
 LEVEL: Final = 0.8
 """Maximum depth of the skin between two contacts, relative to the smaller depth at their peaks. Between two
-bodies, the skin rises; under a plate, whose loads are largest at its border, it does not."""
+bodies, the skin rises; under a plate, whose loads are largest at its border, it does not. Not tuned."""
 RELEVANT_GROUP: Final = 0.05
 """Value of :data:`RELEVANT` for a contact in a group of discs of its own. The evidence for the group shows
 that its loads are not an error of the loads nearby."""
 EVIDENT: Final = 12.0
-"""Gain in log evidence due to a group of discs, in nats, above which the group is a contact."""
+"""Gain in log evidence due to a group of discs, in nats, above which the group is a contact. In 1,500
+untouched frames at a noise of 1e-3, discs gained at most 6 nats."""
 GAP_SIGNIFICANT: Final = 3.0
 """Minimum difference between the load sum at the smaller of two peaks and the load sum between the peaks, in
 standard deviations, for the peaks to be separate contacts."""

@@ -41,7 +41,8 @@ DISC_FITS: Final = 2
 """Maximum number of disc fits per frame."""
 DISC_REJECTIONS: Final = 2
 """Number of futile searches for discs after which a frame is solved without them. If no deformation explains
-the readings, a frame is solved up to 20 times with different wires left out."""
+the readings, a frame is solved many times with different wires left out, and discs were searched for 24 times
+in one frame."""
 REFIT: Final = 0.1
 """Change in any coordinate since the last fit of the discs, relative to the largest displacement, above
 which the discs are refitted."""
